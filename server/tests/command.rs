@@ -120,6 +120,10 @@ fn wrong_usage_prints_the_usage_and_exits_with_3() {
 fn a_negative_number_is_a_wrong_value_and_not_an_unknown_option() {
     for (arguments, allowed) in [
         (&["replay", "a.pcap", "--speed", "-1"][..], "or a factor from 0.1 to 1000 is allowed"),
+        (&["replay", "a.pcap", "--from", "NaN"], "0 or more seconds are allowed"),
+        (&["replay", "a.pcap", "--to", "0"], "a number of seconds above 0 is allowed"),
+        (&["replay", "a.pcap", "--from", "2", "--to", "1"], "--from 2 --to 1: the range must end after it begins"),
+        (&["view", "a.pcap", "--from", "-1"], "0 or more seconds are allowed"),
         (&["simulate", "flat", "--out", "a.pcap", "--seconds", "-1"], "0.1 to 3600 seconds are allowed"),
         (&["demo", "--seconds", "-1"], "0 or more seconds are allowed"),
         (&["ingest", "a.bin", "--hz", "-1"], "0.1 to 100 is allowed"),
@@ -207,7 +211,13 @@ fn options_that_would_have_no_effect_are_refused() {
     simulated(&file, "1");
     let path = file.to_str().unwrap();
     let to = "udp://127.0.0.1:9";
-    let refused: [(&[&str], i32, &str); 7] = [
+    let town = Path::new(env!("CARGO_MANIFEST_DIR")).join("../client/golden/town.mcap").display().to_string();
+    let refused: [(&[&str], i32, &str); 11] = [
+        // Wrong for these files, not for all: an input that does not fit.
+        (&["replay", &town, "--vehicle", "nope"], 2, "--vehicle nope: the configuration has: car"),
+        (&["replay", &town, "--fault", "lost:nosuch@0-1"], 2, "sensor \"nosuch\" is not known; known: top"),
+        (&["replay", &town, "--fault", "stop@50-60"], 2, "fault \"stop@50-60\": it begins after the drive"),
+        (&["replay", &town, "--from", "100"], 2, "the replay plays 0.000 s to 0."),
         (&["replay", path, "--vehicle", "car"], 2, "--vehicle car: the files name no vehicle"),
         (&["replay", path, "--topic", "/points"], 2, "--topic /points: the files have no topics"),
         (&["replay", path, "--record", path], 2, "this file is replayed; name another file"),

@@ -75,7 +75,7 @@ fn many_files_have_a_line_each_the_first_difference_and_the_worst_exit_code() {
     let cell = format!("cell row 5 column 7, channel class: recorded {is}, computed {was}");
     let line = table.lines().find(|line| line.contains("b.mcap")).expect("a line for each file");
     assert!(line.contains("sequence 3, layer safe_path") && line.contains(&cell), "{line}");
-    assert!(table.contains("2 files: 1 equal, 1 different, 0 not checked"), "{table}");
+    assert!(table.contains("2 files: 1 equal, 1 different, 0 equal but not whole, 0 not checked"), "{table}");
 
     fs::write(at("c.mcap"), "not a recording").unwrap();
     let (code, report) = verified(&[&all, "--junit", &junit]);
@@ -156,6 +156,56 @@ fn two_recordings_of_one_drive_are_compared_map_by_map() {
     let first = &layer["first"];
     assert_eq!((&first["sequence"], &first["row"], &first["column"]), (&3.into(), &5.into(), &7.into()));
     assert_eq!(verified(&[&town, "--against", &town]).0, 0);
+}
+
+#[test]
+fn recordings_without_a_map_in_common_are_not_compared() {
+    let folder = tempfile::tempdir().unwrap();
+    let (town, other) = (town().display().to_string(), folder.path().join("other.mcap"));
+    copy(Path::new(&town), &other, |topic, _, data| {
+        if !topic.starts_with("/car/map/") {
+            return Some(data);
+        }
+        let mut map = v1::Map::decode(&data[..]).unwrap();
+        map.header.as_mut().unwrap().capture_end_ns += 1;
+        Some(map.encode_to_vec())
+    });
+    let other = other.display().to_string();
+    let (code, report) = verified(&[&town, "--against", &other]);
+    let reason = report["files"][0]["not_checked"].as_str().unwrap_or_default();
+    let expected = format!("no map in common with {other}: no vehicle and layer has maps of one stamp on both sides");
+    assert!(code == 2 && reason.contains(&expected), "{report:#}");
+}
+
+#[test]
+fn the_sum_counts_a_file_that_is_cut_apart_from_those_that_are_not_checked() {
+    let folder = tempfile::tempdir().unwrap();
+    let cut = folder.path().join("cut.mcap");
+    let bytes = fs::read(town()).unwrap();
+    fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    let output = clearway(&["verify", cut.to_str().unwrap()]);
+    let table = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(2), "{table}");
+    assert!(table.contains("1 file: 0 equal, 0 different, 1 equal but not whole, 0 not checked"), "{table}");
+}
+
+#[test]
+fn one_mistake_of_the_command_line_is_printed_once() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["a.mcap", "b.mcap"] {
+        fs::copy(town(), folder.path().join(name)).unwrap();
+    }
+    let drives = folder.path().to_str().unwrap();
+    let absent = format!("{drives}/absent.mcap");
+    let wrong: [(&[&str], &str); 2] =
+        [(&["--against", &absent], "No such file"), (&["--set", "vehicle.maps.nosuch=1"], "nosuch")];
+    for (options, reason) in wrong {
+        let output = clearway(&[&["verify", drives], options].concat());
+        let (table, error) = (text(&output.stdout), text(&output.stderr));
+        assert_eq!((output.status.code(), &*table), (Some(2), ""), "{error}");
+        assert_eq!(error.matches("clearway: ").count(), 1, "{error}");
+        assert!(error.contains(reason), "{error}");
+    }
 }
 
 #[test]

@@ -199,17 +199,15 @@ async fn a_step_makes_so_many_maps_and_a_range_ends_and_begins_again() {
     let test = async |address: String| {
         let client = Client::connect(&address).await.unwrap();
         let mut transport = transport(&address).await;
-        let mut states = transport.watch_state(v1::WatchStateRequest {}).await.unwrap().into_inner();
-        let (mut sequences, mut position_ns) = (Vec::new(), recorded[0].0 - 1);
+        let mut sequences = Vec::new();
         for step in [1, 2] {
-            transport.control(v1::ReplayControl { step: Some(step), ..Default::default() }).await.unwrap();
-            position_ns = loop {
-                let state = states.message().await.unwrap().unwrap();
-                if state.phase() == v1::ReplayPhase::Paused && state.position_ns > position_ns {
-                    break state.position_ns;
-                }
-            };
-            sequences.push(client.newest("", &[]).await.unwrap().sequence());
+            // The answer comes when the maps are made.
+            let request = v1::ReplayControl { step: Some(step), ..Default::default() };
+            let state = transport.control(request).await.unwrap().into_inner();
+            assert_eq!(state.phase(), v1::ReplayPhase::Paused);
+            let newest = client.newest("", &[]).await.unwrap().sequence();
+            assert_eq!(state.maps, [newest + 1]);
+            sequences.push(newest);
         }
         let mut stream = client.subscribe(Subscription::default()).await.unwrap();
         let (from_ns, to_ns) = (recorded[2].0, recorded[5].0);
@@ -283,6 +281,36 @@ async fn in_lockstep_a_reader_gets_every_map_and_one_that_never_acknowledges_is_
     let error = summary.unwrap_err().to_string();
     let named = "map 0 of vehicle car was not acknowledged within 0.2 s; awaited: gRPC reader of drivability";
     assert!(error.contains(named), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn while_a_step_waits_for_an_acknowledgement_the_state_says_so_and_a_seek_drops_the_steps_owed() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = recorded_drive(folder.path(), 8).await;
+    let recorded = recorded_maps(&drive);
+    let test = async |address: String| {
+        let mut transport = transport(&address).await;
+        let mut states = transport.watch_state(v1::WatchStateRequest {}).await.unwrap().into_inner();
+        let mut steps = transport.clone();
+        // Nobody acknowledges the first map, so the second is not made.
+        let request = v1::ReplayControl { lockstep: Some(true), step: Some(2), ..Default::default() };
+        let stepped = tokio::spawn(async move { steps.control(request).await.unwrap().into_inner() });
+        let awaited = loop {
+            let state = states.message().await.unwrap().unwrap();
+            if !state.awaited.is_empty() {
+                break state.awaited;
+            }
+        };
+        assert_eq!(awaited, "the acknowledgement of map 0 of vehicle car by any reader that acknowledges");
+        let request = v1::ReplayControl { seek_ns: Some(recorded[3].0), ..Default::default() };
+        let state = transport.control(request).await.unwrap().into_inner();
+        assert_eq!((state.phase(), state.position_ns), (v1::ReplayPhase::Paused, recorded[3].0));
+        assert_eq!((&*state.awaited, &state.maps[..]), ("", &[4][..]));
+        assert_eq!(stepped.await.unwrap().jumps, 1, "the step is over when the seek is made");
+    };
+    let (summary, tested) = replayed(Options { paused: true, ..served(&drive) }, test).await;
+    tested.expect("the test ran");
+    summary.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

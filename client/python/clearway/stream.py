@@ -84,7 +84,7 @@ class MapStream:
     def next_or_stale(self) -> Map:
         """Waits for a map newer than the last one returned, or until that one is stale. A stale map is returned again,
         once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. Raises the reason if the
-        stream has ended, and `StopIteration` when closed."""
+        stream has ended, and `StopIteration` at the end of a replay and when closed."""
         return self._next(report_stale=True)
 
     def _next(self, *, report_stale: bool) -> Map:

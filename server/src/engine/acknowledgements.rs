@@ -20,6 +20,8 @@ pub struct Acknowledgements {
     readers: Arc<Mutex<Readers>>,
     changed: Arc<watch::Sender<()>>,
     is_lockstep: Arc<AtomicBool>,
+    /// Why the replay has ended, if a reader did not acknowledge a map in time.
+    timed_out: Arc<watch::Sender<Option<String>>>,
 }
 
 #[derive(Debug, Default)]
@@ -37,7 +39,12 @@ pub struct AcknowledgingReader {
 
 impl Default for Acknowledgements {
     fn default() -> Self {
-        Self { readers: Arc::default(), changed: Arc::new(watch::Sender::new(())), is_lockstep: Arc::default() }
+        Self {
+            readers: Arc::default(),
+            changed: Arc::new(watch::Sender::new(())),
+            is_lockstep: Arc::default(),
+            timed_out: Arc::default(),
+        }
     }
 }
 
@@ -58,6 +65,11 @@ impl Acknowledgements {
         self.is_lockstep.store(is_lockstep, Ordering::Relaxed);
     }
 
+    /// Tells all readers why the replay ends: a map was not acknowledged in time.
+    pub fn time_out(&self, why: String) {
+        self.timed_out.send_replace(Some(why));
+    }
+
     /// Names of the readers that have not finished with `map`; `None` if no reader acknowledges.
     pub fn awaited(&self, map: MapId) -> Option<Vec<String>> {
         let readers = locked(&self.readers);
@@ -75,6 +87,14 @@ impl AcknowledgingReader {
     /// True if a replay waits for the acknowledgement of each map.
     pub fn is_in_lockstep(&self) -> bool {
         self.all.is_lockstep.load(Ordering::Relaxed)
+    }
+
+    /// Waits until the replay ends because a map was not acknowledged in time; returns why.
+    pub async fn timed_out(&self) -> String {
+        let mut timed_out = self.all.timed_out.subscribe();
+        // Cannot fail: this holds the sender.
+        let why = timed_out.wait_for(Option::is_some).await.map(|why| why.clone());
+        why.ok().flatten().unwrap_or_default()
     }
 
     /// Records that the reader has finished with `map` and all before it.

@@ -2,6 +2,10 @@
 
 use std::time::{Duration, Instant};
 
+use clearway_proto::v1;
+
+use crate::encode::Replayed;
+
 /// When events of recorded time are due, and how far their stamps are from the present. It starts at the first event
 /// that it is asked about, and again after [`ReplayClock::restart`].
 #[derive(Debug)]
@@ -44,6 +48,13 @@ impl ReplayClock {
         let passed_ns = recorded_ns.saturating_sub(anchor.recorded_ns).max(0);
         let after = Duration::try_from_secs_f64(passed_ns as f64 * 1e-9 / self.rate).unwrap_or(Duration::MAX);
         anchor.steady.checked_add(after)
+    }
+
+    /// The header that a map of the recorded time `at_ns` is served with; `None` for that of the recorded map.
+    pub fn replayed(&self, state: &v1::ReplayState, boot_id: u64, at_ns: i64, wall_ns: i64) -> Option<Replayed> {
+        let shift_ns = if state.as_live { self.shift_ns(at_ns, wall_ns) } else { 0 };
+        let boot_id = boot_id.wrapping_add(state.jumps);
+        (state.as_live || state.jumps > 0).then_some(Replayed { shift_ns, boot_id })
     }
 
     /// What is added to a stamp of the event's time to move it to the time at which the event is due: one constant at

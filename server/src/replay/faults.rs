@@ -39,7 +39,7 @@ enum Kind {
     Stop,
 }
 
-/// A fault is not one of those that are known.
+/// A fault is not one of those that are known, or does not fit the drive.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("fault {text:?}: {reason}; {SYNTAX}")]
 pub struct FaultError {
@@ -101,12 +101,16 @@ pub struct Faults {
 }
 
 impl Faults {
-    /// These faults, for vehicles with these sensors.
+    /// These faults, for a drive of this length, in seconds, of vehicles with these sensors.
     ///
     /// # Errors
-    /// [`FaultError`] if no vehicle has the sensor of a fault.
-    pub fn new(faults: Vec<Fault>, seed: u64, sensors: Vec<Vec<String>>) -> Result<Self, FaultError> {
+    /// [`FaultError`] if no vehicle has the sensor of a fault, or a fault begins after the drive.
+    pub fn new(faults: Vec<Fault>, seed: u64, length_s: f64, sensors: Vec<Vec<String>>) -> Result<Self, FaultError> {
         for fault in &faults {
+            if fault.from_s > length_s {
+                let reason = format!("it begins after the drive, which is {length_s:.3} s long");
+                return Err(FaultError { text: fault.text.clone(), reason });
+            }
             if let Kind::Lost { sensor } = &fault.kind
                 && !sensors.iter().flatten().any(|name| name == sensor)
             {
@@ -206,7 +210,7 @@ mod tests {
 
     fn faults(texts: &[&str]) -> Faults {
         let faults = texts.iter().map(|text| text.parse().unwrap()).collect();
-        Faults::new(faults, 7, vec![vec!["top".into(), "rear".into()]]).unwrap()
+        Faults::new(faults, 7, 100.0, vec![vec!["top".into(), "rear".into()]]).unwrap()
     }
 
     #[test]
@@ -252,8 +256,11 @@ mod tests {
             let error = text.parse::<Fault>().unwrap_err().to_string();
             assert!(error.contains(reason) && error.contains("stop@FROM-TO"), "{error}");
         }
-        let unknown = Faults::new(vec!["lost:front@1-2".parse().unwrap()], 0, vec![vec!["top".into()]]).unwrap_err();
-        assert!(unknown.to_string().contains("known: top"), "{unknown}");
+        let refused = |text: &str| {
+            Faults::new(vec![text.parse().unwrap()], 0, 5.0, vec![vec!["top".into()]]).unwrap_err().to_string()
+        };
+        assert!(refused("lost:front@1-2").contains("known: top"));
+        assert!(refused("pose:1,2,3@5.1").contains("it begins after the drive, which is 5.000 s long"));
         assert_eq!(Faults::random(3, 60.0, &[vec!["top".into()]]), Faults::random(3, 60.0, &[vec!["top".into()]]));
         assert_eq!(Faults::random(3, 60.0, &[vec!["top".into()]]).len(), 5);
     }

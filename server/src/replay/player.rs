@@ -10,13 +10,12 @@ use clearway_proto::v1::{self, ReplayPhase};
 use tokio::runtime::Handle;
 
 use super::clock::ReplayClock;
-use super::control::{Command, ControlError, ReplayInput, check};
+use super::control::{Command, ControlError, ReplayInput, Step, check};
 use super::outcome::{PlayError, Played};
 use super::snapshots::{Snapshot, Snapshots};
 use super::timeline::{Ahead, Timeline};
 use crate::base::clock::now_ns;
 use crate::base::counted::counted;
-use crate::encode::Replayed;
 use crate::engine::Engine;
 use crate::ingest::files::FilesError;
 use crate::ingest::files::mcap::RefusedMessages;
@@ -62,6 +61,7 @@ pub struct PlayerOptions {
 struct Stopped;
 
 /// A map that readers have to acknowledge before the replay goes on.
+#[derive(Clone, Copy)]
 struct AwaitedMap {
     vehicle: usize,
     sequence: u64,
@@ -83,8 +83,7 @@ pub struct Player {
     /// Recorded time of the newest of them.
     newest_ns: Option<i64>,
     snapshots: Snapshots,
-    /// Maps until the pause; `None` outside a step.
-    step: Option<u32>,
+    step: Option<Step>,
     awaited: Option<AwaitedMap>,
     /// Greatest time by which an event was too late.
     behind_max: Duration,
@@ -238,9 +237,12 @@ impl Player {
         match command {
             None => {}
             Some(Some(Command::Change(request, outcome))) => {
-                let changed = self.change(&request)?;
-                // Fails if the client has gone.
-                let _ = outcome.send(changed.map(|()| self.state.clone()));
+                match (self.change(&request)?, request.step) {
+                    // Answered when its maps are made.
+                    (Ok(()), Some(left)) => self.step = Some(Step { left, outcome }),
+                    // Fails if the client has gone.
+                    (changed, _) => _ = outcome.send(changed.map(|()| self.state.clone())),
+                }
             }
             Some(Some(Command::Stop) | None) => return Ok(Err(Stopped)),
         }
@@ -256,11 +258,10 @@ impl Player {
                 self.awaited = Some(AwaitedMap { vehicle, sequence, since: Instant::now() });
             }
             self.copy_if_due();
-            if let Some(left) = &mut self.step {
-                *left -= 1;
-                if *left == 0 {
-                    self.step = None;
-                    self.set_phase(ReplayPhase::Paused);
+            if let Some(step) = &mut self.step {
+                step.left -= 1;
+                if step.left == 0 {
+                    self.end_step(ReplayPhase::Paused);
                 }
             }
         }
@@ -293,7 +294,7 @@ impl Player {
             let before = engine.maps();
             engine.status.acknowledgements.set_lockstep(state.lockstep);
             while let Ok(queued) = events.try_recv() {
-                engine.replayed = replayed(clock, state, boot_id, state.position_ns, now_ns);
+                engine.replayed = clock.replayed(state, boot_id, state.position_ns, now_ns);
                 engine.step(queued);
             }
             if vehicle.is_none() {
@@ -318,9 +319,17 @@ impl Player {
         if self.state.repeat && self.newest_ns.is_some() {
             return self.jump(self.state.from_ns, true);
         }
-        self.step = None;
-        self.set_phase(ReplayPhase::Ended);
+        self.end_step(ReplayPhase::Ended);
         Ok(())
+    }
+
+    /// Goes to this phase, and ends the step, if there is one.
+    fn end_step(&mut self, phase: ReplayPhase) {
+        self.set_phase(phase);
+        if let Some(step) = self.step.take() {
+            // Fails if the client has gone.
+            let _ = step.outcome.send(Ok(self.state.clone()));
+        }
     }
 
     /// After the end: waits until all readers have left, at most a short time.
@@ -337,22 +346,27 @@ impl Player {
     /// # Errors
     /// [`PlayError::Unacknowledged`] if it has waited too long.
     fn is_acknowledged(&mut self) -> Result<bool, PlayError> {
-        let Some(AwaitedMap { vehicle, sequence, since }) = &self.awaited else { return Ok(true) };
-        let status = &self.vehicles[*vehicle].engine.status;
-        let boot_id = self.vehicles[*vehicle].engine.replayed.map_or(status.boot_id, |replayed| replayed.boot_id);
+        let Some(AwaitedMap { vehicle, sequence, since }) = self.awaited else { return Ok(true) };
+        let engine = &self.vehicles[vehicle].engine;
+        let (status, vehicle) = (&engine.status, engine.status.name.to_string());
+        let boot_id = engine.replayed.map_or(status.boot_id, |replayed| replayed.boot_id);
         let mut changes = status.acknowledgements.changes();
-        let awaited = status.acknowledgements.awaited((boot_id, *sequence));
+        let awaited = status.acknowledgements.awaited((boot_id, sequence));
         if !self.state.lockstep || awaited.as_ref().is_some_and(Vec::is_empty) {
             self.awaited = None;
+            self.state.awaited.clear();
             return Ok(true);
         }
+        let readers = awaited.map_or("any reader that acknowledges".to_owned(), |names| names.join(", "));
         if since.elapsed() >= self.options.acknowledge_timeout {
-            return Err(PlayError::Unacknowledged {
-                vehicle: status.name.to_string(),
-                sequence: *sequence,
-                seconds: self.options.acknowledge_timeout.as_secs_f64(),
-                readers: awaited.map_or("any reader that acknowledges".to_owned(), |names| names.join(", ")),
-            });
+            let seconds = self.options.acknowledge_timeout.as_secs_f64();
+            let error = PlayError::Unacknowledged { vehicle, sequence, seconds, readers };
+            status.acknowledgements.time_out(error.to_string());
+            return Err(error);
+        }
+        if since.elapsed() >= REPORT {
+            self.state.awaited = format!("the acknowledgement of map {sequence} of vehicle {vehicle} by {readers}");
+            self.report();
         }
         // Whichever comes first; then the caller looks for commands and asks again.
         if self.input.commands.is_empty() {
@@ -378,14 +392,15 @@ impl Player {
         let is_waiting = self.state.phase() == ReplayPhase::Waiting;
         let position_ns = self.state.position_ns;
         let outside = (!(from_ns..=to_ns).contains(&position_ns)).then_some(position_ns.clamp(from_ns, to_ns));
-        if let Some(at_ns) = request.seek_ns.or(outside.filter(|_| !self.options.is_recorded && !is_waiting)) {
+        let seek_ns = request.seek_ns.or(outside.filter(|_| !self.options.is_recorded && !is_waiting));
+        if let Some(at_ns) = seek_ns {
             self.jump(at_ns, true)?;
         }
+        if self.step.is_some() && (seek_ns.is_some() || request.step.is_some() || request.paused.is_some()) {
+            self.end_step(ReplayPhase::Paused);
+        }
         match (request.step, request.paused) {
-            (Some(maps), _) => {
-                self.step = Some(maps);
-                self.set_phase(ReplayPhase::Playing);
-            }
+            (Some(_), _) => self.set_phase(ReplayPhase::Playing),
             (None, Some(true)) => self.set_phase(ReplayPhase::Paused),
             (None, Some(false)) if self.state.phase() != ReplayPhase::Ended => self.set_phase(ReplayPhase::Playing),
             // The range may have grown.
@@ -415,6 +430,7 @@ impl Player {
             self.state.jumps += 1;
         }
         self.awaited = None;
+        self.state.awaited.clear();
         while let Some(at_ns) = self.readings.next_ns()?.filter(|at_ns| *at_ns <= to_ns) {
             debug_assert!(at_ns <= to_ns);
             let Some(vehicle) = self.push_next()? else { break };
@@ -430,7 +446,7 @@ impl Player {
         let now_ns = now_ns();
         let (clock, state, boot_id) = (&self.clock, &self.state, self.options.boot_id);
         for ReplayedVehicle { engine, .. } in &mut self.vehicles {
-            engine.replayed = replayed(clock, state, boot_id, to_ns, now_ns);
+            engine.replayed = clock.replayed(state, boot_id, to_ns, now_ns);
             engine.publish_newest_map();
         }
         if self.state.phase() == ReplayPhase::Ended {
@@ -463,19 +479,13 @@ impl Player {
 
     fn report(&mut self) {
         self.reported = Instant::now();
+        self.state.maps = self.vehicles.iter().map(|vehicle| vehicle.engine.maps()).collect();
         self.input.state.send_if_modified(|state| {
             let changed = *state != self.state;
             state.clone_from(&self.state);
             changed
         });
     }
-}
-
-/// The header that a map of the recorded time `at_ns` is served with; `None` for that of the recorded map.
-fn replayed(clock: &ReplayClock, state: &v1::ReplayState, boot_id: u64, at_ns: i64, now_ns: i64) -> Option<Replayed> {
-    let shift_ns = if state.as_live { clock.shift_ns(at_ns, now_ns) } else { 0 };
-    let boot_id = boot_id.wrapping_add(state.jumps);
-    (state.as_live || state.jumps > 0).then_some(Replayed { shift_ns, boot_id })
 }
 
 /// Counts the messages that the files' readers have refused.

@@ -34,15 +34,16 @@ enum Request {
     Play,
     /// Stop until `play`.
     Pause,
-    /// Make this many maps, and pause.
+    /// Make this many maps, and pause; the answer comes when they are made. A seek meanwhile ends the step.
     Step {
         /// Number of maps.
         #[arg(default_value = "1")]
         maps: u32,
     },
-    /// Jump to this time.
+    /// Jump to this time. A paused replay stays paused there; one that has ended plays on.
     Seek {
-        /// Seconds after the first event.
+        /// Seconds after the first event, from 0 on.
+        #[arg(allow_negative_numbers = true)]
         seconds: f64,
     },
     /// Play only this part.
@@ -63,7 +64,8 @@ enum Request {
         #[arg(value_parser = on_or_off, action = ArgAction::Set)]
         on: bool,
     },
-    /// Wait for the acknowledgement of each map, or do not.
+    /// Wait for the acknowledgement of each map, or do not; if none comes in the time of --lockstep-timeout, the server
+    /// ends.
     Lockstep {
         /// on or off.
         #[arg(value_parser = on_or_off, action = ArgAction::Set)]

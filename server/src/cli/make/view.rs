@@ -21,7 +21,7 @@ pub struct Options {
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Begin this many seconds after the first event.
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", value_parser = replay::options::offset)]
     from: Option<f64>,
     /// Open the page with the browser of the desktop (xdg-open).
     #[arg(long)]

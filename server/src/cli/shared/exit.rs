@@ -13,7 +13,8 @@ pub enum Exit {
     Differs = 1,
     /// An input is missing, damaged, cut or refused, a server does not answer, or the command failed.
     Unreadable = 2,
-    /// The command line is wrong.
+    /// The command line is wrong, whatever the files are. A value that does not fit the files is
+    /// [`Exit::Unreadable`].
     WrongUse = 3,
     /// The newest map is stale, or none has come; the state of a vehicle is "error".
     Stale = 4,
@@ -23,7 +24,8 @@ pub enum Exit {
 
 /// The exit codes, as the help text lists them.
 pub const EXIT_CODES: &str = "Exit codes: 0 good, 1 the result differs, 2 an input cannot be read or is not whole, or \
-    the command failed, 3 wrong use, 4 the map is stale (get, watch) or a vehicle's state is error (status), 5 it is \
+    the command failed (a value that does not fit the files too), 3 wrong use, \
+    4 the map is stale (get, watch) or a vehicle's state is error (status), 5 it is \
     warn (status).";
 
 impl Exit {

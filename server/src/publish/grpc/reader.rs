@@ -125,8 +125,9 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
                 return Ok(Some(v1::MapUpdate { replay_ended: true, sent_ns: now_ns(), ..Default::default() }));
             }
             tokio::select! {
-                // Acknowledgements first: they free the credit that the map needs.
+                // Acknowledgements before maps: they free the credit that the map needs.
                 biased;
+                why = timed_out(self.finished.as_ref()) => return Err(Status::unavailable(why)),
                 request = next_request(&mut self.requests) => match request? {
                     Some(request) => self.apply(request)?,
                     // Half closed: a plain reader goes on reading and sends no more acknowledgements.
@@ -188,6 +189,14 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         (*base, *want_full) = (selection.deltas.then_some(map), false);
         let lockstep = self.finished.as_ref().is_some_and(AcknowledgingReader::is_in_lockstep);
         Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, replay_ended: false, lockstep })
+    }
+}
+
+/// Waits until a replay in lockstep ends because a map was not acknowledged; returns why.
+async fn timed_out(reader: Option<&AcknowledgingReader>) -> String {
+    match reader {
+        Some(reader) => reader.timed_out().await,
+        None => std::future::pending().await,
     }
 }
 

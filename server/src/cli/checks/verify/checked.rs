@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 
 use crate::base::sync::locked;
 use crate::cli::shared::exit::Exit;
@@ -71,6 +71,24 @@ impl Checked {
         }
     }
 
+    /// Why the file was not checked; `None` if it was.
+    pub fn not_checked(&self) -> Option<&String> {
+        match &self.outcome {
+            Outcome::Unreadable(reason) => Some(reason),
+            Outcome::Verified(_) | Outcome::Compared(_) => None,
+        }
+    }
+
+    /// True if no map differs as far as the file goes, and it is not whole.
+    pub fn is_equal_but_not_whole(&self) -> bool {
+        let incomplete = match &self.outcome {
+            Outcome::Verified(report) => report.incomplete.as_ref(),
+            Outcome::Compared(comparison) => comparison.incomplete.as_ref(),
+            Outcome::Unreadable(_) => None,
+        };
+        self.exit() == Exit::Unreadable && incomplete.is_some()
+    }
+
     /// True if the whole file was checked and all its maps are equal.
     pub fn is_good(&self) -> bool {
         self.exit() == Exit::Good
@@ -117,7 +135,17 @@ fn outcome_of(file: &Path, check: &Check) -> Result<Outcome> {
 fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
     Ok(match check {
         Check::Verify => Outcome::Verified(verify(file)?),
-        Check::Against { other, worst } => Outcome::Compared(compare(file, &After::Recording(other), *worst)?),
+        Check::Against { other, worst } => {
+            let comparison = compare(file, &After::Recording(other), *worst)?;
+            if comparison.layers.values().all(|layer| layer.maps == 0) {
+                bail!(
+                    "no map in common with {}: no vehicle and layer has maps of one stamp on both sides; are they \
+                     recordings of the same drive?",
+                    other.display()
+                );
+            }
+            Outcome::Compared(comparison)
+        }
         Check::Config { config, set, worst } => {
             let compared = match config.as_deref() {
                 Some(NewConfig(config, tables)) => compare(file, &After::Config(config, Some(tables)), *worst)?,

@@ -9,12 +9,13 @@
 //! | `report` | results -> JSON, JUnit XML |
 //! | `pictures` | the maps that changed most -> pictures |
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
 
-use self::checked::{Check, Checked, NewConfig, Outcome};
+use self::checked::{Check, Checked, NewConfig};
 use self::files::Shard;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files as one_file;
@@ -30,8 +31,9 @@ mod table;
 ///
 /// Or compare their maps with those of another configuration or recording.
 #[derive(Args)]
-#[command(after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole or
-has no event, 3 wrong use.
+#[command(
+    after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
+no event, or no map in common with that of --against, 3 wrong use.
 
 Examples:
   clearway verify drive.mcap
@@ -40,7 +42,8 @@ Examples:
   clearway verify s3://fleet/clearway/parts --shard 2/5
   clearway verify drives --config new.toml --pictures changes
   clearway verify drive.mcap --set vehicle.maps.reach.vehicle_width_m=2.5
-  clearway verify before.mcap --against after.mcap")]
+  clearway verify before.mcap --against after.mcap"
+)]
 pub struct Options {
     /// Recordings (MCAP), folders of them, patterns in quotes, such as 'drives/**/*.mcap', or URLs of a store or of a
     /// recording in it, such as s3://BUCKET/PREFIX.
@@ -124,14 +127,14 @@ pub fn run(options: &Options) -> Result<Exit> {
     if let Some(file) = &options.junit {
         one_file::write(file, report::junit(&results).as_bytes())?;
     }
-    for result in &results {
-        if let Outcome::Unreadable(reason) = &result.outcome {
-            eprintln!("clearway: {reason}");
-        }
-    }
+    let reasons: Vec<&String> = results.iter().filter_map(Checked::not_checked).collect();
+    let different: BTreeSet<&String> = reasons.iter().copied().collect();
+    different.iter().for_each(|reason| eprintln!("clearway: {reason}"));
+    // One mistake of the command line: the table would say nothing but the same.
+    let is_one_mistake = different.len() == 1 && reasons.len() == results.len();
     if options.json {
         print_line(&format!("{:#}", report::json(&results)))?;
-    } else {
+    } else if !is_one_mistake {
         print(&table::text(&results, &check))?;
     }
     Ok(exit(&results))

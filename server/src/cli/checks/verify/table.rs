@@ -42,13 +42,18 @@ pub fn text(results: &[Checked], check: &Check) -> String {
         result.pictures.iter().for_each(|picture| _ = writeln!(text, "  picture {}", picture.display()));
     }
     let good = results.iter().filter(|result| result.is_good()).count();
-    let unchecked = results.iter().filter(|result| result.exit() == Exit::Unreadable).count();
+    let different = results.iter().filter(|result| result.exit() == Exit::Differs).count();
+    let cut = results.iter().filter(|result| result.is_equal_but_not_whole()).count();
     let what = if matches!(check, Check::Verify) { "every map is the map of its events" } else { "every map is equal" };
     let sum = counted(results.len() as u64, "file");
     let _ = match results.len() - good {
         0 if results.is_empty() => writeln!(text, "0 files in this shard: nothing to check"),
         0 => writeln!(text, "{sum}: {what}"),
-        bad => writeln!(text, "{sum}: {good} equal, {} different, {unchecked} not checked", bad - unchecked),
+        bad => writeln!(
+            text,
+            "{sum}: {good} equal, {different} different, {cut} equal but not whole, {} not checked",
+            bad - different - cut
+        ),
     };
     text
 }

@@ -28,7 +28,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::base::sync::locked;
 use crate::cli::make::serve::log_endpoints;
 use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print, print_line, stop_signal};
+use crate::cli::shared::output::{block_on, counted, print, print_line, stop_signal, usage_error};
 use crate::config::{Config, Vehicle};
 use crate::replay::ReplayHandle;
 use crate::replay::control::check;
@@ -64,6 +64,11 @@ const ACKNOWLEDGE_S_MAX: f64 = 10.0;
 /// # Errors
 /// [`ReplayError`].
 pub fn run(options: Options) -> anyhow::Result<Exit> {
+    if let (Some(from), Some(to)) = (options.from, options.to)
+        && from >= to
+    {
+        return Err(usage_error(format!("--from {from} --to {to}: the range must end after it begins")));
+    }
     block_on(replay_and_print(options, None))
 }
 
@@ -262,7 +267,8 @@ pub async fn replay(
 /// Recorded time of the first and the last event. Reads the files once if that time matters.
 fn extent(options: &Options, timeline: &Timeline) -> Result<Option<(i64, i64)>, ReplayError> {
     let has_range = options.from.is_some() || options.to.is_some();
-    if options.serve || has_range || options.fault_seed.is_some() {
+    let has_fault = !options.faults.is_empty() || options.fault_script.is_some() || options.fault_seed.is_some();
+    if options.serve || has_range || has_fault {
         return Ok(Some(timeline.extent()?.ok_or(ReplayError::Empty)?));
     }
     Ok(None)
@@ -281,10 +287,12 @@ fn faults(options: &Options, extent: Option<(i64, i64)>, config: &Config) -> Res
     }
     let names = |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.clone()).collect();
     let sensors: Vec<Vec<String>> = config.vehicles.iter().map(names).collect();
-    if let (Some(seed), Some((begin, end)), true) = (options.fault_seed, extent, all.is_empty()) {
-        all = Faults::random(seed, end.saturating_sub(begin) as f64 * 1e-9, &sensors);
+    // Known if there is a fault.
+    let length_s = extent.map_or(0.0, |(begin, end)| end.saturating_sub(begin) as f64 * 1e-9);
+    if let (Some(seed), true) = (options.fault_seed, all.is_empty()) {
+        all = Faults::random(seed, length_s, &sensors);
     }
-    Ok(Faults::new(all, options.fault_seed.unwrap_or(0), sensors)?)
+    Ok(Faults::new(all, options.fault_seed.unwrap_or(0), length_s, sensors)?)
 }
 
 /// How the replay begins; `extent` is the recorded time of its events, if it is known.
@@ -310,6 +318,8 @@ fn initial_state(options: &Options, extent: Option<(i64, i64)>) -> Result<v1::Re
         jumps: 0,
         vehicles: Vec::new(),
         readers_awaited: options.wait_readers.unwrap_or(0),
+        awaited: String::new(),
+        maps: Vec::new(),
     };
     // Saturates: what lies outside the files is refused.
     let at = |seconds: f64| begin_ns.saturating_add((seconds * 1e9) as i64);

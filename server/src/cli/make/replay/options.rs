@@ -80,10 +80,10 @@ pub struct Options {
     #[arg(long, value_name = "NAME")]
     pub vehicle: Option<String>,
     /// Begin this many seconds after the first event; the maps from there are those of the whole drive.
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", value_parser = offset)]
     pub from: Option<f64>,
     /// End this many seconds after the first event.
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub to: Option<f64>,
     /// Move the stamps of the maps to the present, so that readers judge their age as on the vehicle.
     #[arg(long, requires = "serve")]
@@ -97,7 +97,8 @@ pub struct Options {
     /// Make the next map when every reader that acknowledges has acknowledged the last one; the default speed is max.
     #[arg(long, requires = "serve")]
     pub lockstep: bool,
-    /// Longest wait for an acknowledgement with --lockstep [default: 10].
+    /// Longest wait for an acknowledgement with --lockstep [default: 10]. After it the server ends with exit code 2,
+    /// and names the map and the readers.
     #[arg(long, value_name = "SECONDS", requires = "lockstep", value_parser = seconds)]
     pub lockstep_timeout: Option<f64>,
     /// Wait for this many readers before the first event: gRPC streams, pages, zenoh keys and Foxglove subscriptions.
@@ -140,6 +141,14 @@ impl Speed {
             Self::Times(times) => times,
             Self::Max => f64::INFINITY,
         }
+    }
+}
+
+/// A number of seconds after the first event.
+pub(crate) fn offset(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(seconds) if seconds >= 0.0 && f64::is_finite(seconds) => Ok(seconds),
+        _ => Err("0 or more seconds are allowed".into()),
     }
 }
 

@@ -24,7 +24,16 @@ pub fn line(state: &ReplayState) -> String {
     let flags = [(state.as_live, ", as live"), (state.repeat, ", loop"), (state.lockstep, ", lockstep")];
     let flags: String = flags.iter().filter(|(is_set, _)| *is_set).map(|(_, text)| *text).collect();
     let (from, to) = (at(state.from_ns), at(state.to_ns));
-    format!("{} at {:.3} s of {from:.3} to {to:.3} s, {rate}{flags}", phase(state), at(state.position_ns))
+    let newest: Vec<String> = state
+        .vehicles
+        .iter()
+        .zip(&state.maps)
+        .filter(|(_, maps)| **maps > 0)
+        .map(|(vehicle, maps)| format!(", {vehicle} at map {}", maps - 1))
+        .collect();
+    let awaited = if state.awaited.is_empty() { String::new() } else { format!(", waits for {}", state.awaited) };
+    let (newest, position) = (newest.concat(), at(state.position_ns));
+    format!("{} at {position:.3} s of {from:.3} to {to:.3} s{newest}, {rate}{flags}{awaited}", phase(state))
 }
 
 /// The state as a JSON object; times are seconds after the first event.
@@ -35,7 +44,8 @@ pub fn json(state: &ReplayState) -> String {
         "to_s": at(state.to_ns), "end_s": at(state.end_ns), "begin_ns": state.begin_ns,
         "rate": if state.rate.is_finite() { document!(state.rate) } else { "max".into() },
         "loop": state.repeat, "lockstep": state.lockstep, "as_live": state.as_live, "jumps": state.jumps,
-        "readers_awaited": state.readers_awaited, "vehicles": state.vehicles,
+        "readers_awaited": state.readers_awaited, "awaited": state.awaited,
+        "vehicles": state.vehicles, "maps": state.maps,
     })
     .to_string()
 }
