@@ -37,7 +37,7 @@ use super::listen::InProgress;
 use super::listen::access::Caller;
 use super::page_points::{PagePoints, next_points};
 use super::page_recorder::{PageRecorder, RecorderRequest, recorder_answered};
-use super::page_replay::{PageReplay, PageRequest, replay_changed, replay_json};
+use super::page_replay::{PageReplay, PageRequest, replay_answered, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::base::sync::locked;
 use crate::fleet::Fleet;
@@ -218,9 +218,10 @@ impl Live {
                 _ = every.tick() => self.status(),
                 points = next_points(&mut self.points) => Next::Frame(Frame::Binary(points)),
                 state = replay_changed(&mut replay_state) => text(replay_json(&state, "")),
+                answer = replay_answered(&mut self.replay) => text(answer),
                 answer = recorder_answered(&mut self.recorder) => text(answer),
                 received = socket.recv() => match received {
-                    Some(Ok(Frame::Text(text))) => self.apply(&text).await,
+                    Some(Ok(Frame::Text(text))) => self.apply(&text),
                     // The library answers pings.
                     Some(Ok(_)) => Next::Nothing,
                     Some(Err(_)) | None => Next::End,
@@ -275,11 +276,14 @@ impl Live {
         text(format!(r#"{{"type":"fleet","vehicles":[{own}],"others":[{others}]}}"#))
     }
 
-    async fn apply(&mut self, message: &str) -> Next {
+    fn apply(&mut self, message: &str) -> Next {
         match serde_json::from_str(message) {
             Err(error) => refused("", 0, &error.to_string()),
-            Ok(Request::Replay(request)) => match &self.replay {
-                Some(replay) => text(replay.answer(&request).await),
+            Ok(Request::Replay(request)) => match &mut self.replay {
+                Some(replay) => {
+                    replay.begin(&request);
+                    Next::Nothing
+                }
                 None => refused("", 0, "the server replays nothing that this reader may control"),
             },
             Ok(Request::Recorder(request)) => match &mut self.recorder {

@@ -4,7 +4,11 @@
 //! of nanoseconds, because a browser's doubles cannot hold them, and the rate may be `"max"`. It is answered with the
 //! state after the change, or with `error`.
 
+use std::pin::Pin;
+
 use clearway_proto::v1;
+use futures::StreamExt;
+use futures::stream::FuturesUnordered;
 use serde::Deserialize;
 use serde_json::json;
 use tokio::sync::watch;
@@ -17,13 +21,16 @@ pub(super) struct PageReplay {
     pub handle: ReplayHandle,
     /// True if the client is an operator.
     may_control: bool,
+    /// Requests that are not answered yet: a step waits for its maps, which may wait for this page's acknowledgement.
+    pending: FuturesUnordered<Pin<Box<dyn Future<Output = String> + Send>>>,
 }
 
 impl PageReplay {
     /// The replay as a client reaches it; `None` if it may not reach all its vehicles, which have one time.
     pub fn new(handle: ReplayHandle, caller: &Caller) -> Option<Self> {
         let reaches_all = handle.state().borrow().vehicles.iter().all(|vehicle| caller.may_reach(vehicle));
-        reaches_all.then(|| Self { handle, may_control: caller.is_operator() })
+        let may_control = caller.is_operator();
+        reaches_all.then(|| Self { handle, may_control, pending: FuturesUnordered::new() })
     }
 }
 
@@ -52,20 +59,31 @@ pub(super) fn replay_json(state: &v1::ReplayState, error: &str) -> String {
 }
 
 impl PageReplay {
-    /// Carries out a request; returns the state after it.
-    pub async fn answer(&self, request: &PageRequest) -> String {
-        let outcome = if self.may_control {
-            match request.to_control() {
-                Err(error) => Err(error),
-                Ok(request) => self.handle.control(request).await.map_err(|error| error.to_string()),
-            }
-        } else {
-            Err("the role operator is needed to control the replay".to_owned())
+    /// Begins to carry out a request, which [`replay_answered`] answers with the state after it.
+    pub fn begin(&mut self, request: &PageRequest) {
+        let request = match self.may_control {
+            true => request.to_control(),
+            false => Err("the role operator is needed to control the replay".to_owned()),
         };
-        match outcome {
-            Ok(state) => replay_json(&state, ""),
-            Err(error) => replay_json(&self.handle.state().borrow(), &error),
-        }
+        let handle = self.handle.clone();
+        self.pending.push(Box::pin(async move {
+            let outcome = match request {
+                Err(error) => Err(error),
+                Ok(request) => handle.control(request).await.map_err(|error| error.to_string()),
+            };
+            match outcome {
+                Ok(state) => replay_json(&state, ""),
+                Err(error) => replay_json(&handle.state().borrow(), &error),
+            }
+        }));
+    }
+}
+
+/// Waits for the answer to a pending request; for ever if there is none.
+pub(super) async fn replay_answered(replay: &mut Option<PageReplay>) -> String {
+    match replay {
+        Some(replay) if !replay.pending.is_empty() => replay.pending.next().await.unwrap_or_default(),
+        _ => std::future::pending().await,
     }
 }
 

@@ -72,15 +72,21 @@ pub fn follow(replay: ReplayHandle, runtime: Handle) {
                 None => eprintln!("{KEYS}"),
                 Some(Key::State) => eprintln!("{}", describe(&state)),
                 Some(Key::Quit) => replay.stop(),
-                Some(Key::Control(request)) => match runtime.block_on(replay.control(request)) {
-                    Ok(state) => eprintln!("{}", describe(&state)),
-                    Err(error) => eprintln!("{error}"),
-                },
+                // A step waits for its maps; the next key does not.
+                Some(Key::Control(request)) => drop(runtime.spawn(control(replay.clone(), request))),
             }
         }
     };
     if let Err(error) = std::thread::Builder::new().name("keys".to_owned()).spawn(read) {
         tracing::warn!(%error, "no thread for the keys");
+    }
+}
+
+/// Changes how the replay goes on, and prints its state after that.
+async fn control(replay: ReplayHandle, request: ReplayControl) {
+    match replay.control(request).await {
+        Ok(state) => eprintln!("{}", describe(&state)),
+        Err(error) => eprintln!("{error}"),
     }
 }
 
