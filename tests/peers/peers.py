@@ -16,7 +16,7 @@ the milliseconds, median of the ratios to Patchwork++ in the same round) and rat
 | linefit | ground points (PyPI linefit) |
 | travel | ground points (PyPI travel-seg) |
 | velodyne-decoder | packets of a simulated revolution of an HDL-64E -> points (PyPI velodyne-decoder) |
-| clearway STAGE | see tests/benches/stages.rs; `all` is decode + maps + encode |
+| clearway STAGE | see tests/src/bin/stages.rs; `all` is decode + maps + encode |
 
 The packages are installed into an environment below --venv, which is made at the first run.
 """
@@ -78,20 +78,21 @@ def enter_environment(folder):
 
 
 def build():
-    """The built bench `stages` and the command `clearway`."""
+    """The built program `stages` and the command `clearway`."""
     def executable(arguments, name):
         command = ["cargo", *arguments, "--message-format=json"]
         messages = subprocess.run(command, cwd=REPOSITORY, check=True, stdout=subprocess.PIPE, text=True).stdout
         built = [json.loads(line) for line in messages.splitlines()]
         return next(m["executable"] for m in built if m.get("executable") and m["target"]["name"] == name)
 
-    stages = executable(["bench", "-p", "clearway-tests", "--bench", "stages", "--no-run"], "stages")
+    tests = ["build", "--release", "-p", "clearway-tests", "--no-default-features"]
+    stages = executable([*tests, "--bin", "stages"], "stages")
     command = executable(["build", "--release", "-p", "clearway", "--no-default-features", "-F", "sim"], "clearway")
     return stages, command
 
 
 class Clearway:
-    """The bench `stages` on one scan."""
+    """The program `stages` on one scan."""
 
     def __init__(self, bench, scan, height_m):
         command = [bench, scan, "--height", str(height_m), "--ask"]

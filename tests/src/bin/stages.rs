@@ -1,9 +1,10 @@
 //! Measures each stage of a revolution of an HDL-64E on one thread, in turn with a floor: the least work on the same
 //! data that could do it.
 //!
-//!   cargo bench -p clearway-tests --bench stages                                  a simulated scan of a town
-//!   cargo bench -p clearway-tests --bench stages -- SCAN.bin --height 1.73        a scan in KITTI's format
-//!   cargo bench -p clearway-tests --bench stages -- --ask                         for `tests/peers/peers.py`
+//!   cargo run --release -p clearway-tests --no-default-features --bin stages             a simulated scan of a town
+//!   cargo run ... --bin stages -- SCAN.bin --height 1.73                                 a scan in KITTI's format
+//!
+//! `--ask` is for `tests/peers/peers.py`.
 //!
 //! | stage | from -> to | floor |
 //! |---|---|---|
@@ -60,9 +61,6 @@ struct Arguments {
     /// Reads names of stages, one a line, runs each once, and answers each with its nanoseconds.
     #[arg(long)]
     ask: bool,
-    /// Set by cargo bench.
-    #[arg(long, hide = true)]
-    bench: bool,
 }
 
 fn main() {
