@@ -11,12 +11,10 @@
 //! | points -> cells with an obstacle | `obstacles` |
 //! | points -> cells beside a step of the ground | `steps` |
 //! | cells beside a step -> those between two of them | `joins` |
-//! | cells beside a step -> where the vehicle gets to over unseen ground beside it | `blind_zone` |
 //! | obstacles -> the ground that they hide | `shadow` |
 //! | open and closed cells -> reached cells | `flood` |
 //! | reached cells -> those without a detour over farther ground | `directions` |
 
-mod blind_zone;
 mod cells;
 pub mod config;
 mod directions;
@@ -31,7 +29,6 @@ use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
 use crate::ground::surface::Confidence;
 use crate::sensor::sweep::Sweep;
 
-use blind_zone::BlindZone;
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
 use directions::Directions;
@@ -51,8 +48,6 @@ enum View {
     Clear,
     /// It does where no obstacle casts a shadow on it.
     BesideObstacle,
-    /// No ring comes so near: it does where the vehicle may get to.
-    Blind,
     /// It does not.
     Closed,
 }
@@ -95,7 +90,6 @@ pub struct Reach {
     open: Bits,
     closed: Bits,
     joins: Joins,
-    blind_zone: BlindZone,
     /// Closed cells, and those between two cells beside a step.
     barred: Bits,
     directions: Directions,
@@ -121,7 +115,6 @@ impl Reach {
             open: bits.clone(),
             closed: bits.clone(),
             joins: Joins::new(),
-            blind_zone: BlindZone::new(),
             barred: bits,
             directions: Directions::new(),
             flood: Flood::new(SIDE),
@@ -142,7 +135,6 @@ impl Reach {
         self.steps.find(sweep, ground.heights_m(), &self.cell_of_point, &self.config, |cell| {
             closed.set(cell % SIDE, cell / SIDE)
         });
-        self.blind_zone.update(closed);
         self.barred.copy_from(closed);
         let barred = &mut self.barred;
         self.joins.find(closed, &self.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
@@ -184,11 +176,9 @@ impl Reach {
         }
         self.classify_polar_cells(confidences);
         let (polar_of_cell, shadow, views) = (&self.polar_of_cell, &self.shadow, &self.views);
-        let blind_zone = &self.blind_zone;
         self.open.fill(|cell| match polar_of_cell[cell].of(views) {
             Some(View::Clear) => true,
             Some(View::BesideObstacle) => !shadow.hides(cell),
-            Some(View::Blind) => blind_zone.is_open(cell),
             Some(View::Closed) | None => false,
         });
         for cell in self.steps.seen().chain(self.under_vehicle.iter().copied()) {
@@ -199,14 +189,12 @@ impl Reach {
     /// Decides for each polar cell whether its unseen ground counts as free of obstacles.
     fn classify_polar_cells(&mut self, confidences: &[Confidence]) {
         for column in 0..COLUMNS {
-            let (mut is_hidden, mut is_blind) = (false, true);
+            let mut is_hidden = false;
             for row in 0..ROWS {
                 let cell = row * COLUMNS + column;
                 is_hidden = self.has_obstacle[cell] || is_hidden && confidences[cell] != Confidence::Seen;
-                is_blind &= confidences[cell] != Confidence::Seen && !is_hidden;
                 self.views[cell] = match confidences[cell] {
                     Confidence::Bridged if is_hidden => View::Closed,
-                    Confidence::Bridged if is_blind => View::Blind,
                     Confidence::Seen | Confidence::Bridged if self.is_beside_obstacle(row, column) => {
                         View::BesideObstacle
                     }
