@@ -4,7 +4,7 @@
     python3 tests/peers/peers.py [SCAN.bin ...] [--rounds 30] [--out target/peers]
 
 SCAN.bin is a scan in KITTI's format; by default the three of Patchwork++ in $CLEARWAY_DATA, else ../shared/data. In
-each round every program runs once, in an order that is drawn anew, so that all of them meet the same load. A program's
+each round every program runs once, in an order that is drawn again, so that all of them meet the same load. A program's
 first rounds are not counted.
 
 Writes to --out: times.csv (scan, points, program, round, milliseconds), ratios.csv (scan, points, program, median of
