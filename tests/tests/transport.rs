@@ -292,7 +292,7 @@ async fn while_a_step_waits_for_an_acknowledgement_the_state_says_so_and_a_seek_
         let mut transport = transport(&address).await;
         let mut states = transport.watch_state(v1::WatchStateRequest {}).await.unwrap().into_inner();
         let mut steps = transport.clone();
-        // Nobody acknowledges the first map, so the second is not made.
+        // No reader acknowledges the first map, so the second is not made.
         let request = v1::ReplayControl { lockstep: Some(true), step: Some(2), ..Default::default() };
         let stepped = tokio::spawn(async move { steps.control(request).await.unwrap().into_inner() });
         let awaited = loop {
