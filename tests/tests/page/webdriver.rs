@@ -13,6 +13,8 @@ use tempfile::TempDir;
 const ANSWER_MAX: Duration = Duration::from_secs(60);
 /// Longest wait for something on the page.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// ChromeDriver is started again as often as this when the port it chose is in use.
+const STARTS_MAX: usize = 10;
 /// The key of an element's id in an answer (W3C WebDriver, section 12).
 const ELEMENT: &str = "element-6066-11e4-a52e-4f735466cecf";
 /// Chromium without a display, a graphics card, a sandbox (which root cannot have), and without traffic of its own.
@@ -58,15 +60,7 @@ impl Browser {
 
     /// Starts ChromeDriver and through it a Chromium with a window of this size.
     fn begin(width: u32, height: u32, mobile: Value) -> Self {
-        let mut driver = Command::new("chromedriver")
-            .arg("--port=0")
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .expect("chromedriver starts");
-        let mut output = BufReader::new(driver.stdout.take().expect("stdout is piped")).lines();
-        let port = output.by_ref().map_while(Result::ok).find_map(|line| port_of(&line));
-        let port = port.expect("chromedriver prints its port");
+        let (driver, port, output) = start_driver();
         let profile = tempfile::tempdir().expect("a folder");
         let mut browser = Self { driver, port, session: String::new(), profile, _output: output };
         let mut flags = FLAGS.map(str::to_owned).to_vec();
@@ -187,6 +181,27 @@ impl Drop for Browser {
         let _ = self.driver.kill();
         let _ = self.driver.wait();
     }
+}
+
+/// Starts ChromeDriver; returns it with its port and the rest of its output.
+///
+/// On port 0 it takes a free port of `::1` and then the same port of `127.0.0.1`, and ends when a test beside this one
+/// holds that one.
+fn start_driver() -> (Child, u16, Lines<BufReader<ChildStdout>>) {
+    for _ in 0..STARTS_MAX {
+        let mut driver = Command::new("chromedriver")
+            .arg("--port=0")
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("chromedriver starts");
+        let mut output = BufReader::new(driver.stdout.take().expect("stdout is piped")).lines();
+        if let Some(port) = output.by_ref().map_while(Result::ok).find_map(|line| port_of(&line)) {
+            return (driver, port, output);
+        }
+        driver.wait().expect("chromedriver ended");
+    }
+    panic!("chromedriver found no port in {STARTS_MAX} starts");
 }
 
 /// The port in ChromeDriver's line "ChromeDriver was started successfully on port 37669."
