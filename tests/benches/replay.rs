@@ -31,15 +31,6 @@ const AGE_MS_MAX: f64 = 300.0;
 /// Time for which the page stays open before the drive begins, so that its start is not measured.
 const SETTLE: Duration = Duration::from_secs(3);
 
-/// Collects the age of the shown map at every display frame from now on.
-const COLLECT_AGES: &str = "window.ages = [];
-    const look = () => {
-        const text = document.getElementById('age').textContent, n = parseFloat(text);
-        if (!Number.isNaN(n)) window.ages.push(/ ms$/.test(text) ? n : / s$/.test(text) ? 1e3 * n : 1e6);
-        requestAnimationFrame(look);
-    };
-    look()";
-
 /// Measures the age of the maps of a replay as live when its readers have them.
 #[derive(Parser)]
 struct Arguments {
@@ -88,7 +79,7 @@ fn main() {
         client.replay_control(play).await.expect("it plays");
         // The page shows a map of the paused drive until the first one comes.
         tokio::time::sleep(SETTLE).await;
-        browser.iter().for_each(|browser| _ = browser.run(COLLECT_AGES));
+        browser.iter().for_each(Browser::collect_ages);
         reads_grpc.await.expect("no panic");
     });
     println!("| reader | maps or frames | p50 ms | p99 ms | worst ms | over {AGE_MS_MAX} ms |");

@@ -33,6 +33,8 @@ import tempfile
 import time
 from pathlib import Path
 
+import environment
+
 PACKAGES = [
     "pypatchworkpp==1.4.1",
     "linefit==1.1.0",
@@ -46,35 +48,10 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 WARM_UP = 6
 # Shares of the points of a scan, for the plot of cost against points.
 SHARES = [1.0, 0.5, 0.25, 0.125]
-STAGES = [
-    "decode",
-    "drivability",
-    "height_difference",
-    "terrain",
-    "occupancy",
-    "speed",
-    "safe_path",
-    "occupancy_six_units",
-    "maps",
-    "encode",
-]
 # The ratios to Patchwork++ that Clearway aims at, greatest allowed.
 TARGETS = {"all": 0.45, "drivability": 0.08, "terrain": 0.2, "occupancy_six_units": 0.1}
 # How much faster than velodyne-decoder Clearway aims to decode.
 DECODE_TARGET = 5
-
-
-def enter_environment(folder):
-    """Runs this script again with an interpreter that has the packages, unless this one has them."""
-    interpreter = folder / "bin/python"
-    if Path(sys.prefix).resolve() == folder.resolve():
-        return
-    stamp = folder / "installed"
-    if not stamp.exists() or stamp.read_text() != "\n".join(PACKAGES):
-        subprocess.run([sys.executable, "-m", "venv", "--clear", folder], check=True)
-        subprocess.run([interpreter, "-m", "pip", "install", "--quiet", "--no-input", *PACKAGES], check=True)
-        stamp.write_text("\n".join(PACKAGES))
-    os.execv(interpreter, [str(interpreter), "-B", *sys.argv])
 
 
 def build():
@@ -97,6 +74,7 @@ class Clearway:
     def __init__(self, bench, scan, height_m):
         command = [bench, scan, "--height", str(height_m), "--ask"]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.stages = self.process.stdout.readline().split()
 
     def milliseconds(self, stage):
         print(stage, file=self.process.stdin, flush=True)
@@ -172,7 +150,7 @@ def measure(bench, packets, name, points, height_m, rounds, rows):
         points.tofile(scan)
         own = Clearway(bench, scan, height_m)
         programs = peers(points, height_m, packets)
-        programs |= {f"clearway {stage}": lambda stage=stage: own.milliseconds(stage) for stage in STAGES}
+        programs |= {f"clearway {stage}": lambda stage=stage: own.milliseconds(stage) for stage in own.stages}
         for number in range(WARM_UP + rounds):
             for program in order.sample(sorted(programs), len(programs)):
                 milliseconds = programs[program]()
@@ -264,7 +242,7 @@ def main():
     options = parser.parse_args()
     if not options.scans:
         parser.error("no scans: name some, or set CLEARWAY_DATA")
-    enter_environment(options.venv)
+    environment.enter(options.venv, PACKAGES)
     import numpy
 
     bench, clearway = build()

@@ -125,7 +125,7 @@ fn a_log_of_argoverse_is_judged_by_its_map_of_the_ground() {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn patchwork_is_judged_on_the_same_points_as_the_maps() {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/python/patchwork.py");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/peers/patchwork.py");
     let venv = Path::new(env!("CARGO_TARGET_TMPDIR")).join("python-patchwork");
     let mut command = std::process::Command::new("python3");
     command.arg("-B").arg(script).arg("--json").arg("--venv").arg(venv);

@@ -58,7 +58,8 @@ struct Arguments {
     /// Rounds of the table.
     #[arg(long, default_value_t = 30)]
     rounds: u32,
-    /// Reads names of stages, one a line, runs each once, and answers each with its nanoseconds.
+    /// Prints the names of the stages on one line; then reads names, one a line, runs each once, and answers each with
+    /// its nanoseconds.
     #[arg(long)]
     ask: bool,
 }
@@ -67,6 +68,7 @@ fn main() {
     let arguments = Arguments::parse();
     let mut stages = Stages::new(&arguments);
     if arguments.ask {
+        println!("{}", Stages::NAMES.join(" "));
         for name in stdin().lock().lines().map_while(Result::ok) {
             println!("{}", stages.run(&name).as_nanos());
         }
@@ -146,7 +148,7 @@ impl Stages {
                 let (_, scan) = scan_file::read(&file.to_string_lossy(), &bytes).expect("a scan");
                 (scan, arguments.height)
             }
-            None => (simulated_scan(&vehicle), 1.9),
+            None => (Scan::from(&vehicle.revolution(1)), 1.9),
         };
         let alone = LAYERS.map(|layer| (layer, pipeline(height_m, &[layer])));
         let all = ["maps", "encode"].map(|stage| (stage, pipeline(height_m, &LAYERS)));
@@ -215,21 +217,6 @@ fn pipeline(height_m: f64, layers: &[&str]) -> Pipeline {
     let mut pipeline = Pipeline::new(&config, vec![None]).expect("the default configuration");
     pipeline.set_active_layers(|layer| layers.contains(&layer));
     pipeline
-}
-
-/// A revolution in the town, as a client sends it.
-fn simulated_scan(vehicle: &SimulatedVehicle) -> Scan {
-    let revolution = vehicle.revolution(1);
-    let echo = &revolution.echoes[0];
-    let mut scan = Scan::default();
-    for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 0.0) {
-        scan.x.push(echo.x[slot]);
-        scan.y.push(echo.y[slot]);
-        scan.z.push(echo.z[slot]);
-        scan.intensity.push(0.5);
-        scan.ring.push((slot % revolution.lasers) as u16);
-    }
-    scan
 }
 
 /// Scans of 100 ms from six sensors of four planes each on a vehicle in traffic: 52,800 rays, with and without a

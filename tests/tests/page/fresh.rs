@@ -28,14 +28,6 @@ const PATH_PIXELS: &str = "const map = document.getElementById('map');
     for (let i = 0; i < data.length; i += 4) if (data[i] === 255 && data[i + 1] === 225 && data[i + 2] === 77) count++;
     return count";
 
-/// Collects the age of the shown map at every display frame from now on.
-const COLLECT_AGES: &str = "window.ages = [];
-    const look = () => {
-        const text = document.getElementById('age').textContent, n = parseFloat(text);
-        if (!Number.isNaN(n)) window.ages.push(/ ms$/.test(text) ? n : / s$/.test(text) ? 1e3 * n : 1e6);
-        requestAnimationFrame(look);
-    };
-    look()";
 const AGES: &str = "const sorted = window.ages.toSorted((a, b) => a - b);
     return [0.5, 0.9, 0.99].map((share) => sorted[Math.floor(share * (sorted.length - 1))])";
 
@@ -51,7 +43,7 @@ pub fn the_page_shows_a_fresh_map() {
     browser.until("a map", "return document.getElementById('freshness').textContent !== 'NO MAP YET'");
     assert!(browser.url().ends_with("/?vehicle=car"), "{}", browser.url());
     std::thread::sleep(SETTLE);
-    browser.run(COLLECT_AGES);
+    browser.collect_ages();
     let began = Instant::now();
     let mut fresh = 0;
     for look in 0..looks {

@@ -29,6 +29,15 @@ const FLAGS: [&str; 8] = [
     "--disable-sync",
 ];
 
+/// The script of [`Browser::collect_ages`].
+const COLLECT_AGES: &str = "window.ages = [];
+    const look = () => {
+        const text = document.getElementById('age').textContent, n = parseFloat(text);
+        if (!Number.isNaN(n)) window.ages.push(/ ms$/.test(text) ? n : / s$/.test(text) ? 1e3 * n : 1e6);
+        requestAnimationFrame(look);
+    };
+    look()";
+
 /// A browser with one window. It ends when this is dropped.
 pub struct Browser {
     driver: Child,
@@ -138,6 +147,11 @@ impl Browser {
     /// Runs a script in the page; returns its result.
     pub fn run(&self, script: &str) -> Value {
         self.post(&format!("{}/execute/sync", self.session), json!({ "script": script, "args": [] }))
+    }
+
+    /// Collects the age of the shown map in `window.ages`, ms, at every display frame from now on.
+    pub fn collect_ages(&self) {
+        self.run(COLLECT_AGES);
     }
 
     /// The errors in the browser's console since the last call.

@@ -95,15 +95,7 @@ fn sweep_of_a_revolution(bencher: Bencher) {
 /// The distance series of a scan with rings: a simulated revolution as a client sends it.
 #[divan::bench]
 fn deviations_of_a_scan(bencher: Bencher) {
-    let revolution = revolution();
-    let (echo, lasers) = (&revolution.echoes[0], revolution.lasers);
-    let mut scan = Scan::default();
-    for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 0.0) {
-        scan.x.push(echo.x[slot]);
-        scan.y.push(echo.y[slot]);
-        scan.z.push(echo.z[slot]);
-        scan.ring.push((slot % lasers) as u16);
-    }
+    let scan = Scan::from(&revolution());
     let mut series = RingSeries::default();
     bencher.counter(ItemsCount::new(scan.x.len())).bench_local(|| divan::black_box(series.deviations(&scan).len()));
 }

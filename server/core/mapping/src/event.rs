@@ -2,6 +2,7 @@
 //! can tell a live event from a recorded one.
 
 use bytes::Bytes;
+use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
 use crate::config::sensor::SensorConfig;
@@ -93,6 +94,21 @@ pub struct Scan {
     pub offset_ns: Vec<i32>,
     /// Directions (unit vectors, sensor frame) of rays without a return; empty if the sensor does not state them.
     pub no_returns: Vec<[f32; 3]>,
+}
+
+/// The points of a revolution in the order of `Revolution::points`, as a client would send them.
+impl From<&Revolution> for Scan {
+    fn from(revolution: &Revolution) -> Self {
+        let mut scan = Scan { stamp_ns: revolution.end_ns, ..Scan::default() };
+        for point in revolution.points() {
+            scan.x.push(point.x);
+            scan.y.push(point.y);
+            scan.z.push(point.z);
+            scan.intensity.push(f32::from(point.intensity) / 255.0);
+            scan.ring.push(point.ring);
+        }
+        scan
+    }
 }
 
 /// Pose and speed of the vehicle at one time.

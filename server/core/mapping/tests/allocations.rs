@@ -33,15 +33,7 @@ fn step(pipeline: &mut Pipeline, event: &Event) -> (u64, bool) {
 fn the_maps_of_the_same_scan_need_few_allocations_once_their_buffers_are_there() {
     let vehicle = SimulatedVehicle::new(scenes::town(), ScannerConfig::default());
     let revolution = vehicle.revolution(1);
-    let echo = &revolution.echoes[0];
-    let mut scan = Scan::default();
-    for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 0.0) {
-        scan.x.push(echo.x[slot]);
-        scan.y.push(echo.y[slot]);
-        scan.z.push(echo.z[slot]);
-        scan.intensity.push(0.5);
-        scan.ring.push((slot % revolution.lasers) as u16);
-    }
+    let scan = Scan::from(&revolution);
     let mut pipeline = pipeline();
     for number in 0..12 {
         let stamp_ns = revolution.end_ns + i64::from(number) * PERIOD_NS;

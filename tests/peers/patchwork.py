@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Patchwork++ beside Clearway's maps, on the very same scans and variations.
 
-    python3 tests/python/patchwork.py target/release/clearway FOLDER [--variations all] [options of evaluate]
+    python3 tests/peers/patchwork.py target/release/clearway FOLDER [--variations all] [options of evaluate]
 
 FOLDER may also be sim:random. Runs `clearway evaluate` with these arguments, which writes each scan and its truth to a
 folder. Runs PyPI's pypatchworkpp on these files, and prints for each variation or type of world precision, recall and
@@ -15,27 +15,15 @@ import json
 import os
 import statistics
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
+
+import environment
 
 PACKAGES = ["pypatchworkpp==1.4.1", "numpy"]
 # Number of times that Patchwork++ processes each scan; the time is the median.
 RUNS = 9
 PROTOCOLS = ["vegetation_excluded", "low_vegetation_ground"]
-
-
-def enter_environment(folder):
-    """Runs this script again with an interpreter that has the packages, unless this one has them."""
-    interpreter = folder / "bin/python"
-    if Path(sys.prefix).resolve() == folder.resolve():
-        return
-    stamp = folder / "installed"
-    if not stamp.exists() or stamp.read_text() != "\n".join(PACKAGES):
-        subprocess.run([sys.executable, "-m", "venv", "--clear", folder], check=True)
-        subprocess.run([interpreter, "-m", "pip", "install", "--quiet", "--no-input", *PACKAGES], check=True)
-        stamp.write_text("\n".join(PACKAGES))
-    os.execv(interpreter, [str(interpreter), "-B", *sys.argv])
 
 
 class Counts:
@@ -104,7 +92,7 @@ def main():
     parser.add_argument("--venv", type=Path, default=Path(tempfile.gettempdir()) / "clearway-patchwork")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
-    enter_environment(options.venv)
+    environment.enter(options.venv, PACKAGES)
     # Patchwork++ writes to the standard output, which belongs to the tables.
     tables = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
