@@ -22,6 +22,8 @@ export class Space {
   #changed;
   #ask;
   #scene = null;
+  // True from the loss of WebGL, for instance when the graphics card's process ends, until the browser gives it back.
+  #is_lost = false;
   #camera = START;
   #size = { width: 0, height: 0 };
   #is_scheduled = false;
@@ -52,8 +54,12 @@ export class Space {
     this.#followPointers();
     this.#canvas.addEventListener("wheel", (event) => this.#wheel(event), { passive: false });
     this.#canvas.addEventListener("keydown", (event) => this.#pressKey(event));
-    this.#canvas.addEventListener("webglcontextlost", () => this.#fail("the browser has dropped WebGL; load the page again"));
-    if (typeof WebGL2RenderingContext === "undefined") this.#fail("this browser has no WebGL 2");
+    this.#canvas.addEventListener("webglcontextlost", (event) => this.#lose(event));
+    this.#canvas.addEventListener("webglcontextrestored", () => this.#restore());
+    if (typeof WebGL2RenderingContext === "undefined") {
+      Object.assign(settings, { space: false });
+      Object.assign($("space-button"), { disabled: true, title: "No view in 3-D: this browser has no WebGL 2" });
+    }
     this.#write();
   }
 
@@ -121,8 +127,9 @@ export class Space {
     if ("space" in changes) (this.is_open ? this.#canvas : $("map")).focus();
   }
 
-  // Makes the scene at the first need; false if the browser cannot.
+  // Makes the scene at the first need; false if the browser cannot now.
   #begin() {
+    if (this.#is_lost) return false;
     try {
       this.#scene ??= new Scene(this.#canvas);
     } catch (error) {
@@ -132,10 +139,25 @@ export class Space {
     return this.is_open;
   }
 
+  // The flat map is shown instead, until the user asks again.
   #fail(why) {
-    Object.assign(this.#settings, { space: false });
-    Object.assign($("space-button"), { disabled: true, title: `No view in 3-D: ${why}` });
+    this.#settings.space = false;
     this.#write();
+    setText($("space-text"), `No view in 3-D: ${why}`);
+    $("space-text").hidden = false;
+  }
+
+  #lose(event) {
+    // Without this the browser would not give it back.
+    event.preventDefault();
+    [this.#is_lost, this.#scene] = [true, null];
+    setText($("space-text"), "waiting for the browser to give WebGL back");
+  }
+
+  // Nothing of the old scene is left: the frame and the outline are drawn as new ones.
+  #restore() {
+    [this.#is_lost, this.#frame, this.#outline] = [false, null, null];
+    this.#changed();
   }
 
   #write() {

@@ -52,7 +52,7 @@ pub struct Browser {
 impl Browser {
     /// A Chromium that shows pages at this width and height.
     pub fn start(width: u32, height: u32) -> Self {
-        let browser = Self::begin(width, height, json!({}));
+        let browser = Self::begin(width, height, json!({}), &[]);
         // The window's frame takes some of its height.
         let inner = browser.run("return [innerWidth, innerHeight]");
         let [inner_width, inner_height] = [0, 1].map(|i| inner[i].as_u64().expect("a number") as u32);
@@ -64,15 +64,20 @@ impl Browser {
     /// A Chromium like that of a phone: touch, and two pixels for each CSS pixel.
     pub fn start_phone(width: u32, height: u32) -> Self {
         let metrics = json!({ "width": width, "height": height, "pixelRatio": 2, "touch": true });
-        Self::begin(width, height, json!({ "deviceMetrics": metrics }))
+        Self::begin(width, height, json!({ "deviceMetrics": metrics }), &[])
+    }
+
+    /// A Chromium that gives a page no WebGL.
+    pub fn start_without_webgl(width: u32, height: u32) -> Self {
+        Self::begin(width, height, json!({}), &["--disable-3d-apis"])
     }
 
     /// Starts ChromeDriver and through it a Chromium with a window of this size.
-    fn begin(width: u32, height: u32, mobile: Value) -> Self {
+    fn begin(width: u32, height: u32, mobile: Value, further_flags: &[&str]) -> Self {
         let (driver, port, output) = start_driver();
         let profile = tempfile::tempdir().expect("a folder");
         let mut browser = Self { driver, port, session: String::new(), profile, _output: output };
-        let mut flags = FLAGS.map(str::to_owned).to_vec();
+        let mut flags: Vec<_> = FLAGS.iter().chain(further_flags).map(|&flag| flag.to_owned()).collect();
         flags.push(format!("--user-data-dir={}", browser.profile.path().display()));
         flags.push(format!("--window-size={width},{height}"));
         let mut options = json!({ "args": flags });
