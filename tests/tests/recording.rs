@@ -326,8 +326,10 @@ fn a_full_disk_ends_the_recording_and_maps_continue() {
 fn a_full_file_system_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
     // A file system in memory of 1.5 MiB, which is gone with the process; so the recording is copied from it. The
-    // network is another one too, because every demo has the same ports.
+    // network is another one too, because every demo has the same ports. The demo's picture cannot be written either: a
+    // folder has its name.
     let mounted = "mkdir \"$1/small\" && mount -t tmpfs -o size=1536k none \"$1/small\" && ip link set lo up || exit 9
+        mkdir \"$1/small/full.png.part\"
         \"$0\" demo --seconds 4 --json --record \"$1/small/full.mcap\"
         code=$?
         df --output=avail \"$1/small\" >&2
@@ -335,11 +337,13 @@ fn a_full_file_system_ends_the_recording_and_maps_continue() {
         exit $code";
     let mut command = std::process::Command::new("unshare");
     command.args(["--mount", "--net", "sh", "-c", mounted]);
-    maps_continue_on_a_full_disk(&mut command, folder.path(), "No space left");
+    let complained = maps_continue_on_a_full_disk(&mut command, folder.path(), "No space left");
+    assert!(complained.contains("full.png: Is a directory"), "{complained}");
 }
 
-/// Runs the demo by `command`, which gets the program and a folder, and records to a disk that becomes full.
-fn maps_continue_on_a_full_disk(command: &mut std::process::Command, folder: &Path, reason: &str) {
+/// Runs the demo by `command`, which gets the program and a folder, and records to a disk that becomes full; returns
+/// what it said on the standard error.
+fn maps_continue_on_a_full_disk(command: &mut std::process::Command, folder: &Path, reason: &str) -> String {
     let file = folder.join("full.mcap");
     let output = command.arg(clearway_tests::binaries().join("clearway")).arg(folder).output().unwrap();
     let (said, complained) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
@@ -350,4 +354,5 @@ fn maps_continue_on_a_full_disk(command: &mut std::process::Command, folder: &Pa
     assert!(maps.len() > 1 && maps.last() > maps.first(), "maps are made after the disk has failed: {said}");
     let report = verify(&file.with_extension("unfinished.mcap")).unwrap();
     assert!(report.is_good() && report.cut, "what was recorded before is good: {report:?}");
+    complained.into_owned()
 }

@@ -17,7 +17,7 @@ use crate::encode::picture::{self, Style};
 use crate::server::{Running, Server, Setup};
 
 use super::car::{self, Car};
-use super::error::DemoError;
+use super::error::{DemoError, PictureError};
 use super::report::{Report, Summary};
 use super::rig::{self, Rig};
 use super::sensors::{self, Choice, Sensors};
@@ -117,7 +117,8 @@ pub async fn demo(
                 report(&last);
                 let newest = served.newest.borrow().clone();
                 if let Some((map, picture)) = newest.zip(options.picture.as_deref()) {
-                    tokio::task::block_in_place(|| draw(&map, picture))?;
+                    let drawn = tokio::task::block_in_place(|| draw(&map, picture));
+                    drawn.unwrap_or_else(|error| tracing::warn!("{error}"));
                 }
             }
         }
@@ -144,8 +145,8 @@ pub async fn demo(
 }
 
 /// Draws a map's drivability. A reader of the file sees a whole picture, either the old or the new one.
-fn draw(map: &EncodedMap, file: &Path) -> Result<(), DemoError> {
-    let error = |reason: String| DemoError::Picture { file: file.to_owned(), reason };
+fn draw(map: &EncodedMap, file: &Path) -> Result<(), PictureError> {
+    let error = |reason: String| PictureError { file: file.to_owned(), reason };
     let map = decode_map(map.select(&["drivability".into()]), &Limits::default()).map_err(|e| error(e.to_string()))?;
     let Some(layer) = map.layer("drivability") else { return Ok(()) };
     let style = Style { pixels: 640, rings_m: Some(10.0), ..Style::default() };
