@@ -134,6 +134,14 @@ fn each_revolution_gives_a_map_and_the_end_gives_a_partial_one() {
 }
 
 #[test]
+fn a_mount_is_judged_when_ground_was_seen_and_not_before() {
+    let mut pipeline = pipeline(Some(Model::Vlp16));
+    assert_eq!(pipeline.sensors()[0].mount, None);
+    maps(&mut pipeline, &drive());
+    assert!(pipeline.sensors()[0].mount.is_some());
+}
+
+#[test]
 fn the_same_events_give_the_same_maps() {
     let events = drive();
     let first = maps(&mut pipeline(None), &events);
