@@ -251,6 +251,24 @@ fn empty_rows_are_bridged_as_far_as_configured() {
 }
 
 #[test]
+fn a_grade_is_climbed_across_empty_rows_in_every_direction() {
+    let row = row_at(15.0);
+    let rings = ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0);
+    let apart_m = rings[row + 3] - rings[row];
+    let config = DrivabilityConfig { bridge_rows: 3, grade_max: 0.2, ..DrivabilityConfig::default() };
+    for (grade, is_reached) in [(0.19, true), (0.21, false)] {
+        let terrace = painted(|r, _, _, _| match r {
+            r if r <= row => Some(0.0),
+            r if r == row + 3 => Some(grade * apart_m),
+            _ => None,
+        });
+        let layer = map(&config, &terrace);
+        let reached = (0..360).filter(|column| class(&layer, row + 3, *column) != OBSTACLE).count();
+        assert_eq!(reached, if is_reached { 360 } else { 0 }, "a grade of {grade}");
+    }
+}
+
+#[test]
 fn a_ring_that_changes_its_row_is_one_piece_of_ground() {
     // The only returns: a ring in the last row where segments start, which goes on in the next row.
     let last = benches(&map(&DrivabilityConfig::default(), &painted(|_, _, _, _| Some(0.0))))

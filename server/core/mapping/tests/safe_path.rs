@@ -296,7 +296,8 @@ fn an_occupied_cell_is_an_obstacle_where_it_stands_whichever_way_the_vehicle_hea
     drivability.make(&sweep, &shared.context(), &mut earlier[0]);
     let (_, without) = make(&sweep, &SafePathConfig::default());
     for yaw in [0.0, 0.7, 2.0, -1.3] {
-        let pose = Some(nalgebra::Isometry3::new(nalgebra::Vector3::new(31.0, -7.3, 0.0), yaw * nalgebra::Vector3::z()));
+        let pose =
+            Some(nalgebra::Isometry3::new(nalgebra::Vector3::new(31.0, -7.3, 0.0), yaw * nalgebra::Vector3::z()));
         let mut occupancy = Occupancy::new(&OccupancyConfig::default());
         occupancy.integrate(&Rays { map_from_ego: pose, speed_mps: Some(0.0), ..rays(&post) });
         occupancy.make(&sweep, &Context { map_from_ego: pose, ..Context::default() }, &mut earlier[1]);

@@ -230,10 +230,18 @@ mod tests {
             let apart = [found.pitch_rad - f64::from(slope_x), found.roll_rad + f64::from(slope_y)].map(f64::abs);
             assert!(apart.iter().all(|apart| *apart < 0.003), "{slope_x} {slope_y}: {found:?}");
             assert!((found.height_m + 0.1).abs() < 0.03, "{slope_x} {slope_y}: {found:?}");
-            assert_eq!(check.on_plane.len(), check.lowest_m.iter().filter(|[x, y, z]| {
-                let over_m = z - 0.1 - f64::from(slope_x) * x - f64::from(slope_y) * y;
-                over_m.abs() < 0.2
-            }).count(), "all cells of the ground and no others");
+            assert_eq!(
+                check.on_plane.len(),
+                check
+                    .lowest_m
+                    .iter()
+                    .filter(|[x, y, z]| {
+                        let over_m = z - 0.1 - f64::from(slope_x) * x - f64::from(slope_y) * y;
+                        over_m.abs() < 0.2
+                    })
+                    .count(),
+                "all cells of the ground and no others"
+            );
         }
     }
 
