@@ -101,7 +101,7 @@ mod tests {
         let config = ReachConfig { step_m_max: 0.2, step_slope_min: 0.5, ..ReachConfig::default() };
         for [dx, dy] in NEAR.into_iter().flat_map(|[dx, dy]| [[dx, dy], [-dx, -dy]]) {
             let apart = [dx, dy].map(|cells| CELL_M * cells as f32);
-            let least_m = 0.2_f32.max(0.5 * apart[0].hypot(apart[1]));
+            let least_m = 0.2_f32.max(0.5 * libm::hypotf(apart[0], apart[1]));
             for (height_m, expected) in [(least_m - 0.002, 0), (least_m + 0.002, 2)] {
                 let sweep = Sweep {
                     x: vec![5.1, 5.1 + apart[0]],

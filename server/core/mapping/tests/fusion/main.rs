@@ -197,11 +197,11 @@ fn a_sensor_that_replaces_the_reference_makes_no_map_older_than_the_newest() {
     let mut pipeline = pipeline(&config());
     assert!(step(&mut pipeline, &scan(0, 1_000 * MS)).is_some());
     // The reference sensor stops; the scans of the other one arrive 320 ms after their ends.
-    let mut late = |stamp_ms: i64| {
+    let late = |stamp_ms: i64| {
         let scan = event(1, (stamp_ms + 320) * MS, Body::Scan(ahead(stamp_ms * MS, &[5.0], -1.0)));
         step(&mut pipeline, &scan).map(|map| map.capture_end_ns / MS)
     };
-    assert_eq!([980, 1_000, 1_020].map(|stamp_ms| late(stamp_ms)), [None, None, Some(1_020)]);
+    assert_eq!([980, 1_000, 1_020].map(late), [None, None, Some(1_020)]);
 }
 
 #[test]

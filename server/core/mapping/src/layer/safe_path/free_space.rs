@@ -305,7 +305,7 @@ mod tests {
             states.iter().filter(|state| **state == State::Hole).count()
         };
         for wide in 1..12 {
-            // Across the first column of the last row, so that only its ring can close it; and in whole rows, so that only
+            // Across the first column of the last row, where only its ring can close it; and in whole rows, where only
             // the columns can.
             let ring: Vec<usize> = (0..wide).map(|k| 39 * COLUMNS + (COLUMNS - 2 + k) % COLUMNS).collect();
             let along: Vec<usize> = (0..wide).flat_map(|k| (0..COLUMNS).map(move |c| (20 + k) * COLUMNS + c)).collect();

@@ -234,7 +234,7 @@ mod tests {
         let mut flat = 0;
         for _ in 0..2000 {
             // An ellipsoid of points with any axes, some of them about as long as the threshold.
-            let axes = [0, 1, 2].map(|_| 0.35 * 4.0_f32.powf(2.0 * random()));
+            let axes = [0, 1, 2].map(|_| 0.35 * libm::powf(4.0, 2.0 * random()));
             let turn = Rotation3::from_euler_angles(6.0 * random(), 6.0 * random(), 6.0 * random());
             let mut sweep = Sweep::default();
             for _ in 0..30 {

@@ -299,7 +299,7 @@ mod tests {
             let expected = Vector3::from(plane);
             let place = |i: usize| ((i % 20) as f64 - 9.7, (i / 20) as f64 - 9.6);
             // A third of the points are on objects over the plane.
-            let on_object = |i: usize| if i % 3 == 0 { 0.3 + i as f64 * 0.01 } else { 0.0 };
+            let on_object = |i: usize| if i.is_multiple_of(3) { 0.3 + i as f64 * 0.01 } else { 0.0 };
             let samples: Vec<_> = (0..400)
                 .map(|i| (place(i), on_object(i)))
                 .map(|((x, y), over_m)| Vector3::new(x, y, plane[0] * x + plane[1] * y + plane[2] + over_m))
