@@ -256,15 +256,17 @@ fn a_grade_is_climbed_across_empty_rows_in_every_direction() {
     let rings = ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0);
     let apart_m = rings[row + 3] - rings[row];
     let config = DrivabilityConfig { bridge_rows: 3, grade_max: 0.2, ..DrivabilityConfig::default() };
-    for (grade, is_reached) in [(0.19, true), (0.21, false)] {
-        let terrace = painted(|r, _, _, _| match r {
-            r if r <= row => Some(0.0),
-            r if r == row + 3 => Some(grade * apart_m),
-            _ => None,
-        });
-        let layer = map(&config, &terrace);
-        let reached = (0..360).filter(|column| class(&layer, row + 3, *column) != OBSTACLE).count();
-        assert_eq!(reached, if is_reached { 360 } else { 0 }, "a grade of {grade}");
+    for (grade, expected) in [(0.19, NOT_DRIVABLE), (0.21, OBSTACLE)] {
+        for direction in [5, 50, 95, 140, 185, 230, 275, 320] {
+            let terrace = painted(|r, column, _, _| match r {
+                r if r <= row => Some(0.0),
+                r if r == row + 3 && column.abs_diff(direction) <= 2 => Some(grade * apart_m),
+                _ => None,
+            });
+            // The terrace is too narrow for the vehicle; a cell that was not reached would be an obstacle.
+            let found = class(&map(&config, &terrace), row + 3, direction);
+            assert_eq!(found, expected, "a grade of {grade} towards {direction} degrees");
+        }
     }
 }
 
