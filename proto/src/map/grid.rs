@@ -227,4 +227,20 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn the_farthest_edge_along_the_axes_is_the_range() {
+        let grid = |origin_x_m, origin_y_m| Grid::Cartesian {
+            origin_x_m,
+            origin_y_m,
+            width: 4,
+            height: 4,
+            cell_m: 1.0,
+            yaw_rad: 0.3,
+            first_ix: 0,
+            first_iy: 0,
+        };
+        let ranges = [[-3.0, -2.0], [-1.0, -2.0], [-2.0, -3.5], [-2.0, 0.5]].map(|[x, y]| grid(x, y).range_m_max());
+        assert_eq!(ranges, [3.0, 3.0, 3.5, 4.5]);
+    }
 }

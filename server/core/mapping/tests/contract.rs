@@ -130,6 +130,17 @@ fn a_wall_is_an_obstacle_in_every_layer() {
 }
 
 #[test]
+fn a_difference_of_height_is_an_obstacle_exactly_if_it_is_above_the_limit() {
+    let config = HeightDifferenceConfig { difference_m_max: 0.5, ..Default::default() };
+    for (height_m, expected) in [(0.49, "drivable"), (0.5, "drivable"), (0.51, "obstacle")] {
+        let mut sweep = empty(Model::Hdl64eS2);
+        [0.0, height_m].into_iter().for_each(|z| add(&mut sweep, [10.0, 0.1, z]));
+        let layer = make(&mut HeightDifference::new(&config), &sweep);
+        assert_eq!(class_name(&layer, cell_at(&layer, 10.0, 0.1).unwrap()), expected, "{height_m} m");
+    }
+}
+
+#[test]
 fn the_same_sweep_gives_the_same_bytes() {
     let sweep = cast(Model::Hdl64eS2, court);
     for mut maker in makers() {

@@ -150,6 +150,21 @@ fn criterion_2_a_boundary_that_the_plane_misses_is_not_crossed() {
 }
 
 #[test]
+fn criterion_2_the_plane_of_the_larger_segment_decides() {
+    // A platform 16 columns wide and two rows deep rises by 0.14 m a row. Its own plane meets the ground before it, but
+    // the plane of the ground misses its first row by 0.14 m.
+    let first = row_at(15.0);
+    let platform = painted(|row, column, _, _| match (row.wrapping_sub(first), column) {
+        (rows @ 0..2, 172..188) => Some(0.14 * (rows + 1) as f32),
+        _ => Some(0.0),
+    });
+    for (plane_error_m_max, expected) in [(0.1, NOT_DRIVABLE), (0.2, DRIVABLE)] {
+        let config = DrivabilityConfig { plane_error_m_max, ..DrivabilityConfig::default() };
+        assert_eq!(class(&map(&config, &platform), first, 180), expected, "{plane_error_m_max}");
+    }
+}
+
+#[test]
 fn criterion_3_a_passage_narrower_than_3_m_is_not_crossed() {
     // A bank 0.14 m high behind a wall 15 m ahead, with a gap in the wall.
     let passage = |half_width: f32| {
@@ -236,6 +251,46 @@ fn empty_rows_are_bridged_as_far_as_configured() {
 }
 
 #[test]
+fn a_grade_is_climbed_across_empty_rows_in_every_direction() {
+    let row = row_at(15.0);
+    let rings = ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0);
+    let apart_m = rings[row + 3] - rings[row];
+    let config = DrivabilityConfig { bridge_rows: 3, grade_max: 0.2, ..DrivabilityConfig::default() };
+    for (grade, expected) in [(0.19, NOT_DRIVABLE), (0.21, OBSTACLE)] {
+        for direction in [5, 50, 95, 140, 185, 230, 275, 320] {
+            let terrace = painted(|r, column, _, _| match r {
+                r if r <= row => Some(0.0),
+                r if r == row + 3 && column.abs_diff(direction) <= 2 => Some(grade * apart_m),
+                _ => None,
+            });
+            // The terrace is too narrow for the vehicle; a cell that was not reached would be an obstacle.
+            let found = class(&map(&config, &terrace), row + 3, direction);
+            assert_eq!(found, expected, "a grade of {grade} towards {direction} degrees");
+        }
+    }
+}
+
+#[test]
+fn a_ring_that_changes_its_row_is_one_piece_of_ground() {
+    // The only returns: a ring in the last row where segments start, which goes on in the next row.
+    let last = benches(&map(&DrivabilityConfig::default(), &painted(|_, _, _, _| Some(0.0))))
+        .iter()
+        .position(|radius_m| *radius_m >= DrivabilityConfig::default().blind_zone_m)
+        .unwrap();
+    for (from, to) in [(100..140, 140..180), (100..140, 60..100)] {
+        let ring = painted(|row, column, _, _| {
+            (row == last && from.contains(&column) || row == last + 1 && to.contains(&column)).then_some(0.0)
+        });
+        for (bridge_rows, expected) in [(0, OBSTACLE), (1, DRIVABLE)] {
+            let config = DrivabilityConfig { bridge_rows, passage_m_min: 0.0, ..DrivabilityConfig::default() };
+            let layer = map(&config, &ring);
+            assert_eq!(class(&layer, last, from.start + 20), DRIVABLE);
+            assert_eq!(class(&layer, last + 1, to.start + 20), expected, "columns {to:?}, {bridge_rows} rows bridged");
+        }
+    }
+}
+
+#[test]
 fn the_seed_of_the_thesis_needs_a_point_in_cell_0_0() {
     let config = DrivabilityConfig { seed: Seed::FirstCell, ..DrivabilityConfig::default() };
     let whole = painted(|_, _, _, _| Some(0.0));
@@ -259,12 +314,16 @@ fn a_high_object_beside_the_vehicle_is_no_seed() {
 
 #[test]
 fn a_plane_is_found_through_sloping_ground() {
-    let sweep = painted(|_, _, x, y| Some(0.001 * x - 0.0005 * y + 0.01));
-    let layer = map(&DrivabilityConfig::default(), &sweep);
-    assert_eq!(layer.planes.len(), 2);
-    let [a, b, c] = layer.planes[0];
-    assert!((a - 0.001).abs() < 1e-6 && (b + 0.0005).abs() < 1e-6 && (c - 0.01).abs() < 1e-5, "{a} {b} {c}");
-    assert_eq!(layer.planes[1], [0.0; 3], "the unreachable segment has none");
+    // All around, and in a sector in which x and y depend on each other.
+    for columns in [0..360, 20..80] {
+        let height = |x: f32, y: f32| 0.001 * x - 0.0005 * y + 0.01;
+        let sweep = painted(|_, column, x, y| columns.contains(&column).then(|| height(x, y)));
+        let layer = map(&DrivabilityConfig::default(), &sweep);
+        assert_eq!(layer.planes.len(), 2);
+        let [a, b, c] = layer.planes[0];
+        assert!((a - 0.001).abs() < 1e-6 && (b + 0.0005).abs() < 1e-6 && (c - 0.01).abs() < 1e-5, "{a} {b} {c}");
+        assert_eq!(layer.planes[1], [0.0; 3], "the unreachable segment has none");
+    }
 }
 
 #[test]

@@ -107,7 +107,9 @@ fn each_revolution_gives_a_map_and_the_end_gives_a_partial_one() {
     let events = drive();
     let mut pipeline = pipeline(Some(Model::Vlp16));
     assert!(pipeline.newest_revolution().is_none());
+    assert_eq!(pipeline.sensors()[0].mount, None, "no ground was seen");
     let mut made = maps(&mut pipeline, &events);
+    assert!(pipeline.sensors()[0].mount.is_some());
     let end = Event { sequence: events.len() as u64, arrival_ns: 7, source: 0, body: Body::End };
     made.push(pipeline.step(&end).unwrap().unwrap().clone());
     assert_eq!(pipeline.step(&end), Ok(None), "no revolution is unfinished");

@@ -3,16 +3,17 @@
 mod common;
 
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, ReachConfig, SafePathConfig};
+use clearway_mapping::config::{DrivabilityConfig, OccupancyConfig, ReachConfig, SafePathConfig};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
+use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::safe_path::SafePath;
 use clearway_mapping::layer::safe_path::class::SafePathClass;
 use clearway_mapping::layer::safe_path::distance::Distances;
 use clearway_mapping::layer::safe_path::free_space::State;
 use clearway_mapping::layer::safe_path::links::Links;
 use clearway_mapping::layer::safe_path::medial_axis::{MedialAxis, Point};
-use clearway_mapping::layer::{Context, Layer, LayerMaker};
+use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 use proptest::prelude::*;
@@ -282,6 +283,36 @@ fn the_vehicles_own_bonnet_is_no_obstacle_but_a_box_ahead_is() {
     // The ground that the box hides is not free, except in the blind zone.
     let free = |layer: &Layer| classes(layer)[cell_at(layer, 4.1, 0.1).unwrap()];
     assert_eq!((free(&own), free(&before)), (UNKNOWN, OBSTACLE));
+}
+
+#[test]
+fn an_occupied_cell_is_an_obstacle_where_it_stands_whichever_way_the_vehicle_heads() {
+    let sweep = cast(Model::Hdl64eS2, court);
+    let mut post = empty(Model::Hdl64eS2);
+    (0..20).for_each(|_| add(&mut post, [9.1, 4.1, 0.5]));
+    let shared = shared(&sweep);
+    let mut drivability = Drivability::new(&DrivabilityConfig::default());
+    let mut earlier = [drivability.layer(), Occupancy::new(&OccupancyConfig::default()).layer()];
+    drivability.make(&sweep, &shared.context(), &mut earlier[0]);
+    let (_, without) = make(&sweep, &SafePathConfig::default());
+    for yaw in [0.0, 0.7, 2.0, -1.3] {
+        let pose =
+            Some(nalgebra::Isometry3::new(nalgebra::Vector3::new(31.0, -7.3, 0.0), yaw * nalgebra::Vector3::z()));
+        let mut occupancy = Occupancy::new(&OccupancyConfig::default());
+        occupancy.integrate(&Rays { map_from_ego: pose, speed_mps: Some(0.0), ..rays(&post) });
+        occupancy.make(&sweep, &Context { map_from_ego: pose, ..Context::default() }, &mut earlier[1]);
+        let mut map = SafePath::new(&SafePathConfig::default());
+        let mut layer = map.layer();
+        map.make(&sweep, &Context { earlier: &earlier, ..shared.context() }, &mut layer);
+        let obstacle = |layer: &Layer, cell: usize| classes(layer)[cell] == OBSTACLE;
+        let added: Vec<[f32; 2]> = (0..classes(&layer).len())
+            .filter(|cell| obstacle(&layer, *cell) && !obstacle(&without, *cell))
+            .map(|cell| [cell % 240, cell / 240].map(|index| (index as f32 + 0.5) * 0.25 - 30.0))
+            .collect();
+        // Half a diagonal of both kinds of cells.
+        let near = |[x, y]: &[f32; 2]| (x - 9.1).hypot(y - 4.1) < 0.36;
+        assert!(!added.is_empty() && added.iter().all(near), "yaw {yaw}: {added:?}");
+    }
 }
 
 #[test]

@@ -5,8 +5,9 @@
 mod common;
 
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{Extrinsics, SensorConfig, TerrainConfig, Variant, VehicleConfig};
+use clearway_mapping::config::{Extrinsics, ReachConfig, SensorConfig, TerrainConfig, Variant, VehicleConfig};
 use clearway_mapping::event::{Body, Event};
+use clearway_mapping::ground::Ground;
 use clearway_mapping::layer::roughness::Roughness;
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
@@ -236,6 +237,20 @@ fn the_plane_of_a_cell_is_the_ground_under_it() {
         assert!((height[cell] as f32 * 0.05 - (0.04 * x - 0.08 * y)).abs() < 0.05, "{x} {y}: {}", height[cell]);
         assert_eq!((slope_x[cell], slope_y[cell]), (2, -4));
     }
+}
+
+#[test]
+fn the_near_plane_is_the_ground_around_the_vehicle() {
+    for [a, b] in [[0.04, -0.08], [0.0, 0.0], [-0.1, 0.05]] {
+        let mut ground = Ground::new(ReachConfig::default().outline());
+        ground.estimate(&cast(Model::Hdl64eS2, |x, y, z| z <= a * x + b * y));
+        let near = ground.near_plane();
+        let apart = [near.abc[0] - a, near.abc[1] - b, near.abc[2]].map(f32::abs);
+        assert!(near.is_seen && apart.iter().all(|apart| *apart < 0.01), "{a} {b}: {near:?}");
+    }
+    let mut blind = Ground::new(ReachConfig::default().outline());
+    blind.estimate(&empty(Model::Hdl64eS2));
+    assert_eq!(blind.near_plane(), Default::default(), "no return defines a plane");
 }
 
 fn simulate(scene: Scene) -> Sweep {

@@ -338,6 +338,24 @@ pub fn row_radii_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
 mod tests {
     use super::*;
 
+    #[test]
+    fn a_ray_of_each_ring_ends_on_the_ground_wherever_its_laser_is_mounted() {
+        for offset_m in [-0.2, 0.0, 0.3] {
+            let mut calibration = Calibration::factory(clearway_lidar::Model::Hdl64eS2);
+            calibration.lasers.truncate(1);
+            calibration.lasers[0].vert_offset_correction = offset_m;
+            for elevation in [-0.4_f64, -0.2, -0.05] {
+                calibration.lasers[0].vert_correction = elevation;
+                let [radius_m] = ring_radii_m(&calibration, 1.8, 60.0)[..] else { panic!("{offset_m} {elevation}") };
+                // The ray begins at the offset along the normal (-sin, cos), and runs along (cos, sin).
+                let (sin, cos) = libm::sincos(elevation);
+                let range_m = (f64::from(radius_m) + offset_m * sin) / cos;
+                let height_m = range_m * sin + offset_m * cos;
+                assert!((height_m + 1.8).abs() < 1e-5, "{offset_m} {elevation}: {height_m}");
+            }
+        }
+    }
+
     /// The exact column, and the distance from the position to the nearest column border, in columns.
     fn exact(x: f32, y: f32, columns: u16) -> (usize, f64) {
         let turns = libm::atan2(f64::from(y), f64::from(x)) / std::f64::consts::TAU;

@@ -219,3 +219,55 @@ fn continues((newest, newest_ns): (Isometry3<f64>, i64), map_from_ego: Option<&I
         && moved.translation.vector.norm() <= JUMP_M[0] + JUMP_M[1] * seconds
         && moved.rotation.angle() <= JUMP_RAD[0] + JUMP_RAD[1] * seconds
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Seconds after the first map.
+    fn at(seconds: f64) -> i64 {
+        ((100.0 + seconds) * NS_PER_S) as i64
+    }
+
+    /// A point in each second cell about the vehicle, `z_m` over the ground.
+    fn points(z_m: f32) -> Sweep {
+        let places = || (0..1600).map(|i| ((i % 40) as f32 * 0.5 - 9.9, (i / 40) as f32 * 0.5 - 9.9));
+        let (x, y) = places().unzip();
+        Sweep { x, y, z: vec![z_m; 1600], ..Sweep::default() }
+    }
+
+    /// Adds a map with these points over the ground z = 0, and returns how many points it gets from memory.
+    fn map(memory: &mut Memory, sweep: &Sweep, seconds: f64) -> usize {
+        memory.extend(sweep, Some(&Isometry3::identity()), at(seconds));
+        memory.remember(sweep.x.len(), &sweep.z);
+        memory.state().points
+    }
+
+    fn memory() -> Memory {
+        Memory::new(&MemoryConfig { enabled: true, ..MemoryConfig::default() }).unwrap()
+    }
+
+    #[test]
+    fn a_cell_is_recalled_exactly_if_the_map_has_no_point_in_it() {
+        let (mut memory, sweep) = (memory(), points(0.0));
+        assert_eq!(map(&mut memory, &sweep, 0.0), 0);
+        assert_eq!(map(&mut memory, &sweep, 0.1), 0, "the map sees all cells itself");
+        let half = Sweep { x: sweep.x[..800].into(), y: sweep.y[..800].into(), z: vec![0.0; 800], ..Sweep::default() };
+        assert_eq!(map(&mut memory, &half, 0.2), 800);
+        assert_eq!(map(&mut memory, &Sweep::default(), 0.3), 1600);
+    }
+
+    #[test]
+    fn where_an_obstacle_stood_only_ground_seen_later_is_recalled() {
+        let config = MemoryConfig::default();
+        let forgotten_s = 0.2 + f64::from(config.obstacle_s_max);
+        for (heights_m, expected) in [([0.0, 1.0], 0), ([1.0, 0.0], 1600)] {
+            let mut memory = memory();
+            map(&mut memory, &points(heights_m[0]), 0.0);
+            map(&mut memory, &points(heights_m[1]), 0.1);
+            assert_eq!(map(&mut memory, &Sweep::default(), 0.2), 1600, "{heights_m:?}");
+            assert_eq!(map(&mut memory, &Sweep::default(), forgotten_s), expected, "{heights_m:?}");
+            assert_eq!(map(&mut memory, &Sweep::default(), f64::from(config.ground_s_max) + 0.2), 0, "{heights_m:?}");
+        }
+    }
+}

@@ -211,3 +211,22 @@ impl Reach {
             .any(|cell| self.has_obstacle[cell])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cells_beside_an_obstacle_share_a_side_or_a_corner_with_it() {
+        for (row, column) in [(0, 0), (1, 7), (20, COLUMNS - 1), (ROWS - 1, 100)] {
+            let mut reach = Reach::new(&ReachConfig::default());
+            reach.has_obstacle[row * COLUMNS + column] = true;
+            let near = |a: usize, b: usize| a.abs_diff(b) <= 1;
+            for cell in 0..ROWS * COLUMNS {
+                let (other_row, other) = (cell / COLUMNS, cell % COLUMNS);
+                let expected = near(row, other_row) && [0, 1, COLUMNS - 1].contains(&column.abs_diff(other));
+                assert_eq!(reach.is_beside_obstacle(other_row, other), expected, "{row} {column}, {other_row} {other}");
+            }
+        }
+    }
+}

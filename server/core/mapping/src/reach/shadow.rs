@@ -89,4 +89,19 @@ mod tests {
         assert!(shadow([1.0, 3.0]).last().unwrap() > &58.0);
         assert!(shadow([0.1, 0.1]).is_empty());
     }
+
+    #[test]
+    fn a_shadow_is_as_wide_as_the_obstacle_that_casts_it() {
+        // Cells 15 m away in a row across the shadow of a wall in cell 0, which is 10 m away.
+        let across = |step: usize| [15.0, (step as f32 - 20.0) * 0.1];
+        let mut shadow = Shadow::new(std::iter::once([10.0, 0.0]).chain((0..41).map(across)));
+        shadow.cast(0, 0.5, [0.0, 1.5], 2.0);
+        // 0.5 m at 10 m are 0.75 m at 15 m, up to the width of an azimuth on each side.
+        let slack_m = TAU / AZIMUTHS as f32 * 15.0;
+        for step in 0..41 {
+            let aside_m = across(step)[1].abs();
+            assert!(shadow.hides(1 + step) || aside_m > 0.375 - slack_m, "{aside_m} m aside is hidden");
+            assert!(!shadow.hides(1 + step) || aside_m < 0.375 + slack_m, "{aside_m} m aside is seen");
+        }
+    }
 }

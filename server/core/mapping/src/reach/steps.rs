@@ -90,3 +90,30 @@ impl Steps {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::cells::cell;
+    use super::*;
+
+    #[test]
+    fn a_step_is_as_high_as_configured_and_as_steep_as_configured_in_every_direction() {
+        let config = ReachConfig { step_m_max: 0.2, step_slope_min: 0.5, ..ReachConfig::default() };
+        for [dx, dy] in NEAR.into_iter().flat_map(|[dx, dy]| [[dx, dy], [-dx, -dy]]) {
+            let apart = [dx, dy].map(|cells| CELL_M * cells as f32);
+            let least_m = 0.2_f32.max(0.5 * libm::hypotf(apart[0], apart[1]));
+            for (height_m, expected) in [(least_m - 0.002, 0), (least_m + 0.002, 2)] {
+                let sweep = Sweep {
+                    x: vec![5.1, 5.1 + apart[0]],
+                    y: vec![3.1, 3.1 + apart[1]],
+                    z: vec![0.0, height_m],
+                    ..Sweep::default()
+                };
+                let cells: Vec<u32> = sweep.x.iter().zip(&sweep.y).map(|(x, y)| cell(*x, *y)).collect();
+                let mut marked = std::collections::BTreeSet::new();
+                Steps::new().find(&sweep, &[0.0, 0.0], &cells, &config, |cell| marked.extend([cell]));
+                assert_eq!(marked.len(), expected, "{height_m} m high, {dx} and {dy} cells apart");
+            }
+        }
+    }
+}

@@ -36,6 +36,16 @@ fn scans_with_equal_stamps_are_in_one_map_whichever_arrives_first() {
 }
 
 #[test]
+fn stamps_are_equal_within_a_fiftieth_of_the_period() {
+    for (apart_ms, waits) in [(1, true), (2, true), (3, false)] {
+        let scans = |n: i64| [late(0, n * 100, 0), late(1, n * 100 - apart_ms, apart_ms + 5)];
+        let made = maps(&(1..8).flat_map(scans).collect::<Vec<_>>());
+        let expected_ms = if waits { 5 } else { 0 };
+        assert!(made.len() == 7 && made[2..].iter().all(|(at_ms, map)| at_ms - map.capture_end_ns / MS == expected_ms));
+    }
+}
+
+#[test]
 fn a_map_waits_no_longer_than_a_quarter_of_the_deadline() {
     let pose = |at_ms: i64| {
         let pose = EgoPose { stamp_ns: at_ms * MS, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };

@@ -193,6 +193,18 @@ fn a_reference_sensor_whose_clock_is_wrong_is_replaced() {
 }
 
 #[test]
+fn a_sensor_that_replaces_the_reference_makes_no_map_older_than_the_newest() {
+    let mut pipeline = pipeline(&config());
+    assert!(step(&mut pipeline, &scan(0, 1_000 * MS)).is_some());
+    // The reference sensor stops; the scans of the other one arrive 320 ms after their ends.
+    let late = |stamp_ms: i64| {
+        let scan = event(1, (stamp_ms + 320) * MS, Body::Scan(ahead(stamp_ms * MS, &[5.0], -1.0)));
+        step(&mut pipeline, &scan).map(|map| map.capture_end_ns / MS)
+    };
+    assert_eq!([980, 1_000, 1_020].map(late), [None, None, Some(1_020)]);
+}
+
+#[test]
 fn scans_with_older_stamps_are_accepted_after_the_deadline() {
     let mut pipeline = pipeline(&config());
     step(&mut pipeline, &scan(1, 5_000 * MS));

@@ -226,6 +226,20 @@ fn a_ray_that_passes_under_or_over_an_object_does_not_clear_it() {
 }
 
 #[test]
+fn a_return_below_the_ground_tells_nothing_unless_the_range_excuses_it() {
+    // 0.3 m below the ground are allowed, and a hundredth of the range.
+    for (x, depth_m, tells) in [(5.0, 0.33, true), (5.0, 0.37, false), (40.0, 0.68, true), (40.0, 0.72, false)] {
+        let mut sweep = Sweep { mount_height_m: 1.8, ..Sweep::default() };
+        add(&mut sweep, [x, 0.1, -depth_m]);
+        let mut occupancy = occupancy();
+        occupancy.integrate(&rays(&sweep));
+        let layer = made(&mut occupancy, None);
+        let is_clear = classes(&layer).contains(&CLEAR);
+        assert_eq!(is_clear, tells, "{depth_m} m below the ground at {x} m");
+    }
+}
+
+#[test]
 fn the_grid_scrolls_with_the_vehicle_and_the_world_stays() {
     // A post with 20 returns at (30, 5) of the world, and free ground before it, are seen once; then no scan arrives.
     let mut occupancy = occupancy();

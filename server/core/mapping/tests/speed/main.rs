@@ -137,6 +137,10 @@ fn a_road_makes_neither_an_obstacle_nor_unknown_ground_passable() {
         assert_eq!(classes(&layer)[at(11.5, 0.1)], UNKNOWN);
         assert_eq!(classes(&layer)[at(5.0, 0.1)], ROAD);
         assert_eq!(classes(&layer)[at(5.0, 5.0)], PASSABLE);
+        let number = |wanted: &[u8]| classes(&layer).iter().filter(|class| wanted.contains(class)).count() as f64;
+        let known = number(&[OBSTACLE, PASSABLE, ROAD]);
+        assert_eq!(figure(&layer, "passable_share"), number(&[PASSABLE, ROAD]) / known);
+        assert_eq!(figure(&layer, "road_share"), number(&[ROAD]) / known);
         let (before, after) = (values(&bare, "speed"), values(&layer, "speed"));
         for (cell, class) in classes(&layer).iter().enumerate() {
             match *class {

@@ -289,3 +289,31 @@ fn mark_along(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hole_is_closed_exactly_if_it_is_as_narrow_as_configured() {
+        const COLUMNS: usize = 360;
+        let row_radius_m: Vec<f32> = (1..=40).map(|row| row as f32 * 0.5).collect();
+        let marked = |hole: &[usize], hole_m_max: f32| {
+            let mut states = vec![State::Drivable; 40 * COLUMNS];
+            hole.iter().for_each(|cell| states[*cell] = State::Unknown);
+            mark_holes(&mut states, &row_radius_m, COLUMNS, hole_m_max);
+            states.iter().filter(|state| **state == State::Hole).count()
+        };
+        for wide in 1..12 {
+            // Across the first column of the last row, where only its ring can close it; and in whole rows, where only
+            // the columns can.
+            let ring: Vec<usize> = (0..wide).map(|k| 39 * COLUMNS + (COLUMNS - 2 + k) % COLUMNS).collect();
+            let along: Vec<usize> = (0..wide).flat_map(|k| (0..COLUMNS).map(move |c| (20 + k) * COLUMNS + c)).collect();
+            let widths_m = [wide as f32 * 20.0 * std::f32::consts::TAU / COLUMNS as f32, wide as f32 * 0.5];
+            for (hole, width_m) in [ring, along].iter().zip(widths_m) {
+                assert_eq!(marked(hole, width_m * 1.01), hole.len(), "{width_m} m");
+                assert_eq!(marked(hole, width_m * 0.99), 0, "{width_m} m");
+            }
+        }
+    }
+}

@@ -214,3 +214,30 @@ fn around(ix: usize, iy: usize, side: usize) -> impl Iterator<Item = usize> {
     let near = move |i: usize| i.saturating_sub(1)..(i + 2).min(side);
     near(iy).flat_map(move |y| near(ix).map(move |x| y * side + x))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bumpiness_of_a_cell_alone_is_the_standard_deviation_of_its_heights() {
+        let (context, config) = (Context::default(), SpeedConfig::default());
+        for (middle_m, spread_m) in [(0.0, 0.02), (-0.3, 0.05), (0.1, 0.0)] {
+            let heights = [-1.5, -0.5, 0.5, 1.5].map(|share: f32| middle_m + share * spread_m);
+            let mut map = HeightMap::new(80, 0.25);
+            for _ in 0..2 {
+                map.update(
+                    &Sweep { x: vec![5.1; 4], y: vec![-3.1; 4], z: heights.into(), ..Sweep::default() },
+                    &context,
+                    &config,
+                );
+                map.judge(&context, &config);
+            }
+            let [cell] = map.known().collect::<Vec<_>>()[..] else { panic!("one cell is known") };
+            assert_eq!(map.centre_m(cell), [5.125, -3.125]);
+            // The variance of four heights at ±0.5 and ±1.5 is 1.25.
+            let found_m = map.bumpiness_m()[cell];
+            assert!((found_m - 1.25_f32.sqrt() * spread_m).abs() < 5e-4, "{middle_m} {spread_m}: {found_m}");
+        }
+    }
+}

@@ -215,3 +215,41 @@ fn shape([largest, middle, smallest]: [f64; 3]) -> Shape {
         Shape::Scatter
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::division::Division;
+    use super::*;
+    use crate::sensor::sweep::Sweep;
+    use nalgebra::{Rotation3, Vector3};
+
+    #[test]
+    fn the_bounds_of_flatness_decide_as_the_eigenvalues_do() {
+        const FLATNESS_M2_MAX: f64 = 0.01;
+        let mut state = 1_u64;
+        let mut random = move || {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            (state >> 40) as f32 / (1 << 24) as f32 - 0.5
+        };
+        let mut flat = 0;
+        for _ in 0..2000 {
+            // An ellipsoid of points with any axes, some of them about as long as the threshold.
+            let axes = [0, 1, 2].map(|_| 0.35 * libm::powf(4.0, 2.0 * random()));
+            let turn = Rotation3::from_euler_angles(6.0 * random(), 6.0 * random(), 6.0 * random());
+            let mut sweep = Sweep::default();
+            for _ in 0..30 {
+                let point = turn * Vector3::from(axes.map(|axis| axis * random()));
+                sweep.x.push(point.x);
+                sweep.y.push(point.y);
+                sweep.z.push(point.z);
+            }
+            let mut cells = Cells::new(5.0, 1.0, Division::Halves);
+            cells.sort_points(&sweep, &sweep.z, 10.0);
+            let moments = cells.moments(0, cells.slots());
+            let expected = Principal::from_covariance(moments.covariance()).height_disturbance() < FLATNESS_M2_MAX;
+            assert_eq!(is_flat(&moments, FLATNESS_M2_MAX), expected, "{moments:?}");
+            flat += u32::from(expected);
+        }
+        assert!((300..1700).contains(&flat), "{flat} of 2000 are flat: both answers are common");
+    }
+}

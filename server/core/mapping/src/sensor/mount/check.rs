@@ -220,6 +220,32 @@ mod tests {
     }
 
     #[test]
+    fn a_plane_that_leans_in_both_directions_is_found_beside_objects() {
+        for [slope_x, slope_y] in [[0.03, 0.08], [-0.02, -0.08], [0.0, 0.1]] {
+            let mut leaning = sweep(slope_x, 0.1);
+            leaning.z.iter_mut().zip(&leaning.y).for_each(|(z, y)| *z += slope_y * y);
+            let mut check = MountCheck::default();
+            check.push(&leaning, [0.0, 0.0, 1.8]);
+            let found = check.deviation().unwrap();
+            let apart = [found.pitch_rad - f64::from(slope_x), found.roll_rad + f64::from(slope_y)].map(f64::abs);
+            assert!(apart.iter().all(|apart| *apart < 0.003), "{slope_x} {slope_y}: {found:?}");
+            assert!((found.height_m + 0.1).abs() < 0.03, "{slope_x} {slope_y}: {found:?}");
+            assert_eq!(
+                check.on_plane.len(),
+                check
+                    .lowest_m
+                    .iter()
+                    .filter(|[x, y, z]| {
+                        let over_m = z - 0.1 - f64::from(slope_x) * x - f64::from(slope_y) * y;
+                        over_m.abs() < 0.2
+                    })
+                    .count(),
+                "all cells of the ground and no others"
+            );
+        }
+    }
+
+    #[test]
     fn a_contradiction_ends_below_two_thirds_of_its_beginning() {
         let mut check = MountCheck::default();
         let after = |check: &mut MountCheck, height_m: f32| {

@@ -177,6 +177,8 @@ mod tests {
         assert!((middle - 2.01).abs() < 1e-12 && (0.01..0.03).contains(&std), "{middle} {std}");
         let [middle, _] = combined(vec![[1.0, 1.0], [2.0, 0.1], [3.0, 1.0]]);
         assert_eq!(middle, 2.0, "the most certain value");
+        let [middle, _] = combined(vec![[1.0, 0.25], [2.0, 0.7], [3.0, 0.7]]);
+        assert_eq!(middle, 1.0, "one value weighs more than two that are uncertain");
         assert_eq!(combined(vec![[5.0, 0.25]]), [5.0, 0.25]);
         let [_, std] = combined(vec![[0.0, 0.1], [1.0, 0.1], [2.0, 0.1]]);
         assert!(std > 1.4, "values that differ by more than they state are uncertain: {std}");

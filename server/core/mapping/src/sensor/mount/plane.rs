@@ -288,3 +288,27 @@ impl RandomIndices {
         ((self.0.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 33) as usize) % n
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_candidate_is_the_plane_that_most_points_lie_on() {
+        for plane in [[0.0, 0.0, -1.8], [0.2, -0.25, -1.5], [-0.05, 0.3, -2.0]] {
+            let expected = Vector3::from(plane);
+            let place = |i: usize| ((i % 20) as f64 - 9.7, (i / 20) as f64 - 9.6);
+            // A third of the points are on objects over the plane.
+            let on_object = |i: usize| if i.is_multiple_of(3) { 0.3 + i as f64 * 0.01 } else { 0.0 };
+            let samples: Vec<_> = (0..400)
+                .map(|i| (place(i), on_object(i)))
+                .map(|((x, y), over_m)| Vector3::new(x, y, plane[0] * x + plane[1] * y + plane[2] + over_m))
+                .collect();
+            let found = best_candidate(&samples).unwrap();
+            assert!((found.0 - expected).amax() < 1e-9, "{plane:?}: {found:?}");
+            assert!(samples.iter().enumerate().all(|(i, p)| (found.distance(p) - on_object(i)).abs() < 1e-9));
+            let up = Vector3::new(-plane[0], -plane[1], 1.0).normalize();
+            assert!((found.height_m() + plane[2] * up.z).abs() < 1e-9, "{plane:?}");
+        }
+    }
+}
