@@ -207,6 +207,10 @@ fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_
         if sequence == 300 {
             durable = counts.durable_events("car");
         }
+        if sequence == 600 {
+            // Many attempts to begin a part have failed meanwhile.
+            assert!(counts.problem().unwrap().contains("the disk fails"), "{:?}", counts.problem());
+        }
         let arrival_ns = 1_700_000_000_000_000_000 + now.as_nanos() as i64;
         let event = Event { sequence, arrival_ns, source: 0, body: Body::Datagram(vec![7; 100].into()) };
         handle.record_event(&event);
@@ -238,6 +242,43 @@ fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_
     let (first, last) = (missing[0], missing[missing.len() - 1]);
     assert!(first >= durable && (890..915).contains(&last), "missing from {first} to {last}");
     println!("lost {} of 1200 events: {first} to {last}; the disk failed from 300 to 899", missing.len());
+}
+
+#[test]
+fn each_event_is_durable_within_flush_ms_if_a_sync_takes_no_more_than_half_of_it() {
+    let (config, disk) = (config(), FailingDisk::default());
+    let options = Recorder { flush_ms: 1000, ..Recorder::default() };
+    let header = Header { vehicles: vec![("car".into(), vec![])], config: config.to_toml(), ..Header::default() };
+    let began = Instant::now();
+    let (mut writer, mut handles) = RecordingWriter::new(disk, &options, &header, false, began).unwrap();
+    let counts = writer.counts();
+    // An event comes each 20 ms, then none for three seconds, then as before. A sync takes 480 ms: the recorder works
+    // again after that time, and takes what came meanwhile from its queue.
+    let sync_ms = 480;
+    let comes_ms: Vec<u64> = (0..5_000).chain(8_000..13_000).step_by(20).collect();
+    let (mut came, mut durable, mut works_ms, mut oldest_ms) = (0, 0, 0, 0);
+    for ms in 0..14_000 {
+        while came < comes_ms.len() && comes_ms[came] <= ms {
+            let arrival_ns = 1_700_000_000_000_000_000 + 1_000_000 * comes_ms[came] as i64;
+            let event = Event { sequence: came as u64, arrival_ns, source: 0, body: Body::Datagram(vec![7; 9].into()) };
+            handles[0].record_event(&event);
+            came += 1;
+        }
+        if ms < works_ms {
+            continue;
+        }
+        // Item after item, until a sync takes the recorder's time.
+        while writer.write_next(began + Duration::from_millis(ms)) && counts.durable_events("car") == durable {}
+        for event in durable..counts.durable_events("car") {
+            works_ms = ms + sync_ms;
+            oldest_ms = oldest_ms.max(works_ms - comes_ms[event as usize]);
+        }
+        durable = counts.durable_events("car");
+    }
+    assert_eq!((came, durable), (comes_ms.len(), came as u64), "all are on the disk");
+    assert!(oldest_ms <= options.flush_ms, "an event was on the disk after {oldest_ms} ms");
+    drop(handles);
+    writer.finish();
 }
 
 #[test]

@@ -144,7 +144,21 @@ async fn a_recording_is_stopped_started_saved_and_listed() {
     let listed = service.list(v1::ListRecordingsRequest {}).await.unwrap().into_inner().parts;
     assert!(listed.iter().any(|part| part.file.ends_with("car.mcap")), "{listed:?}");
     assert!(listed.iter().any(|part| part.is_unfinished), "{listed:?}");
+    let address = running.grpc.expect("gRPC is served").to_string();
+    let json = async |request: &'static [&'static str]| {
+        let arguments = [&["recorder"], request, &["--json", "--server", &address]].concat().join(" ");
+        let run = move || clearway_tests::run(Path::new("."), "clearway", &arguments.split(' ').collect::<Vec<_>>());
+        let output = tokio::task::spawn_blocking(run).await.unwrap();
+        serde_json::from_slice::<serde_json::Value>(&output.stdout).expect("JSON")
+    };
+    let [listed_as_json, told] = [json(&["list"]).await, json(&["status"]).await];
+    assert_eq!(listed_as_json["parts"].as_array().unwrap().len(), listed.len(), "{listed_as_json}");
+    assert!(listed_as_json["parts"][0]["bytes"].as_u64().unwrap() > 0, "{listed_as_json}");
+    assert_eq!((&told["state"], &told["saved"]), (&"recording".into(), &serde_json::json!([])), "{told}");
+    assert_eq!(told["topics"].as_array().unwrap().len() as u64, 1 + fixture::LAYERS, "{told}");
     let part = service.status(v1::RecordingStatusRequest {}).await.unwrap().into_inner().status.unwrap().part;
+    let saved = json(&["save", "--reason", "as-json"]).await;
+    assert!(saved["saved"][0].as_str().unwrap().contains("as-json"), "{saved}");
     within("shutdown", running.shutdown()).await.unwrap();
     let report = verify(&folder.path().join(format!("car.part-{part:04}.mcap"))).unwrap();
     assert!(report.is_good() && report.equal >= fixture::LAYERS && report.unjudged == 0, "{report:?}");

@@ -6,8 +6,10 @@ mod venv;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
+use clearway::config::Recorder;
+use clearway::record::writer::{Files, Folder};
 use clearway::store::index::{Entry, Search, search};
 use clearway::store::{location, upload};
 use clearway_tests::{binaries, workspace};
@@ -46,6 +48,24 @@ fn found(environment: &[(&str, &str)], store: &str, more: &[&str]) -> usize {
     let output = clearway(environment, &[&["recordings", "--store", store, "--json"], more].concat());
     assert_eq!(output.status.code(), Some(0), "{more:?}: {}", text(&output.stderr));
     serde_json::from_slice::<Value>(&output.stdout).unwrap().as_array().unwrap().len()
+}
+
+#[test]
+fn a_file_that_a_recorder_writes_is_not_sent_however_long_it_has_not_changed() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = Recorder { file: folder.path().join("parked.mcap"), ..Recorder::default() };
+    let mut files = Folder::open(&options).unwrap();
+    let mut being_written = files.create(1).unwrap();
+    being_written.write_all(b"events").unwrap();
+    modified_hours_ago(&files.path(1), 2);
+    assert_eq!(upload::unconfirmed(folder.path()).unwrap(), [""; 0].map(PathBuf::from));
+    // A crash ends the lock with the process. A child that another test starts has a copy of it until it runs.
+    drop(being_written);
+    let began = Instant::now();
+    while upload::unconfirmed(folder.path()).unwrap() != [files.path(1)] {
+        assert!(began.elapsed() < Duration::from_secs(60), "the file that was left is not sent");
+        std::thread::yield_now();
+    }
 }
 
 #[test]

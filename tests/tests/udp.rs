@@ -143,6 +143,39 @@ async fn every_datagram_is_counted_in_the_ledger_and_in_the_recording() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn what_the_kernel_drops_in_a_flood_is_counted_for_the_vehicle_and_for_the_sensor_of_the_socket() {
+    let mut config = config();
+    // The smallest buffer that is allowed, and a queue that has space for all that comes through it.
+    config.vehicles[0].udp.as_mut().unwrap().receive_buffer_bytes = 65_536;
+    config.vehicles[0].queue = 65_536;
+    let running = start(config).await;
+    let (data, telemetry) = running.inputs[0].udp.unwrap();
+    let (packets, position) = datagrams();
+    let sender = socket("127.0.0.1");
+    let status = running.vehicles.0[0].status.clone();
+    let of_sensor = || status.snapshot().sensors[0].ledger.clone();
+    let mut sent = 0;
+    for (at, payload) in [(data, &packets[0]), (telemetry, &position)] {
+        let dropped = ledger(&running, 0).kernel_drops;
+        for round in 0.. {
+            assert!(round < 10_000, "the kernel dropped none of {sent} datagrams");
+            (0..500).for_each(|_| _ = sender.send_to(payload, at).unwrap());
+            sent += 500;
+            if ledger(&running, 0).kernel_drops > dropped {
+                break;
+            }
+        }
+    }
+    // No datagram follows.
+    let all = |ledger: &Ledger| ledger.received + ledger.lost + ledger.kernel_drops;
+    until("each datagram is counted", || all(&ledger(&running, 0)) == sent).await;
+    assert_eq!(all(&of_sensor()), sent, "{:?}", of_sensor());
+    assert!(of_sensor().kernel_drops > 0);
+    within("shutdown", running.shutdown()).await.unwrap();
+    assert_eq!(all(&of_sensor()), sent, "{:?}", of_sensor());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_multicast_group_is_received_on_its_interface() {
     let mut config = config();
     let groups = vec!["239.255.77.1".parse().unwrap()];

@@ -12,7 +12,8 @@ use super::error::ValueError;
 pub struct Recorder {
     /// MCAP file to write; a relative path starts at the configuration's folder. Empty: nothing is recorded.
     pub file: PathBuf,
-    /// Longest time from a message to the disk, in ms: what a crash or a power cut may cost of the recording.
+    /// Longest time from a message to the disk, in ms: what a crash or a power cut may cost of the recording. A sync
+    /// begins after half of it.
     pub flush_ms: u64,
     /// Events and maps that may wait for the disk; more are counted as dropped.
     pub queue: usize,

@@ -8,7 +8,7 @@ use super::error::ValueError;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Store {
-    /// A folder, or `s3://BUCKET/PREFIX`; empty: parts stay where they are.
+    /// A folder, also as `file:///FOLDER`, or `s3://BUCKET/PREFIX`; empty: parts stay where they are.
     pub url: String,
     /// True if each part is deleted from the recorder's folder after the store has confirmed it.
     pub delete: bool,
@@ -16,11 +16,13 @@ pub struct Store {
 
 impl Store {
     pub(super) fn check(&self) -> Result<(), ValueError> {
-        match self.url.split_once("://") {
-            Some((scheme, _)) if scheme != "s3" => {
-                Err(ValueError::new("store.url", &self.url, "a folder or s3://BUCKET/PREFIX"))
-            }
-            _ => Ok(()),
-        }
+        let is_allowed = match self.url.split_once("://") {
+            None => true,
+            Some(("file", path)) => path.starts_with('/'),
+            Some(("s3", path)) => path.split('/').next().is_some_and(|bucket| !bucket.is_empty()),
+            Some(_) => false,
+        };
+        let allowed = "a folder, file:///FOLDER or s3://BUCKET/PREFIX";
+        if is_allowed { Ok(()) } else { Err(ValueError::new("store.url", &self.url, allowed)) }
     }
 }

@@ -184,6 +184,9 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         ("[[vehicle]]", "[zenoh]\nlisten = [\"quic/1.2.3.4:1\"]\n[[vehicle]]", "tcp/127.0.0.1:7447"),
         ("[[vehicle]]", "[recorder]\nflush_ms = 1\n[[vehicle]]", "10 to 60000"),
         ("[[vehicle]]", "[recorder]\nmaps = \"some\"\n[[vehicle]]", "full"),
+        ("[[vehicle]]", "[store]\nurl = \"ftp://a/b\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
+        ("[[vehicle]]", "[store]\nurl = \"s3:///prefix\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
+        ("[[vehicle]]", "[store]\nurl = \"file://mnt\"\n[[vehicle]]", "file:///FOLDER"),
         (
             "[[vehicle]]",
             "[recorder]\nfile = \"a\"\nwarm_up_ms = 500\n[vehicle_defaults.maps.memory]\nenabled = true\n[[vehicle]]",
@@ -193,6 +196,9 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
     for (from, to, allowed) in wrong {
         let error = error(&NEEDED.replacen(from, to, 1));
         assert!(error.contains("clearway.toml") && error.contains(allowed), "{to}: {error}");
+    }
+    for url in ["", "/mnt/archive", "file:///mnt/archive", "s3://fleet", "s3://fleet/clearway"] {
+        assert!(Store { url: url.into(), delete: false }.check().is_ok(), "{url}");
     }
     assert!(error("").contains("at least one [[vehicle]]"));
     assert!(error(&NEEDED.replace("z_m = 1.9\n", "")).contains("z_m"), "a missing transform is an error");

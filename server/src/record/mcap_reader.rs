@@ -26,9 +26,10 @@ use super::mcap_summary;
 
 /// Version of the contents of our recordings, in their metadata. A recording without one has version 1.
 pub const FORMAT: u32 = 1;
-/// The name of the metadata that a repaired file has at each place at which a part of the damaged file is lost, and the
-/// key of what is lost there.
-pub(super) const REPAIR_METADATA: (&str, &str) = ("clearway-repair", "lost");
+/// The name of the metadata that a repaired file has at each place at which a part of the damaged file is lost.
+pub(super) const REPAIR_METADATA: &str = "clearway-repair";
+/// The key of what is lost there.
+pub(super) const REPAIR_LOST_KEY: &str = "lost";
 /// The packages of the messages that this version reads.
 const PACKAGES: [&str; 1] = ["clearway.v1."];
 
@@ -417,8 +418,8 @@ impl McapReader {
                 self.header.metadata.clone_from(&metadata.metadata);
                 self.check_format()?;
             }
-            Record::Metadata(metadata) if metadata.name == REPAIR_METADATA.0 => {
-                self.repaired.extend(metadata.metadata.get(REPAIR_METADATA.1).cloned());
+            Record::Metadata(metadata) if metadata.name == REPAIR_METADATA => {
+                self.repaired.extend(metadata.metadata.get(REPAIR_LOST_KEY).cloned());
             }
             Record::Attachment { header, data, .. } => {
                 let text = String::from_utf8_lossy(data).into_owned();

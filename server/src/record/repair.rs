@@ -10,7 +10,7 @@ use mcap::{Attachment, Compression, McapError, WriteOptions};
 use serde_json::{Value, json};
 
 use super::damage::Damage;
-use super::mcap_reader::{McapReadError, McapReader, REPAIR_METADATA};
+use super::mcap_reader::{McapReadError, McapReader, REPAIR_LOST_KEY, REPAIR_METADATA};
 use crate::base::file_advice::advised;
 
 /// What was recovered and what is lost.
@@ -165,8 +165,8 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
 
 /// The metadata at the place of a loss.
 fn lost_here(lost: Vec<String>) -> Metadata {
-    let (name, key) = REPAIR_METADATA;
-    Metadata { name: name.into(), metadata: BTreeMap::from([(key.to_owned(), lost.join("; "))]) }
+    let metadata = BTreeMap::from([(REPAIR_LOST_KEY.to_owned(), lost.join("; "))]);
+    Metadata { name: REPAIR_METADATA.into(), metadata }
 }
 
 /// Reads the new file from its start to its end.

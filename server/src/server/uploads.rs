@@ -109,7 +109,7 @@ impl Uploads {
     /// The finished parts that are not settled.
     fn waiting(&mut self) -> Vec<(PathBuf, Seen)> {
         let mut waiting = Vec::new();
-        for part in self.control.list().into_iter().filter(|part| !part.is_unfinished) {
+        for part in self.control.list().into_iter().filter(|part| !part.is_unfinished || part.is_left) {
             let part = PathBuf::from(part.file);
             let Some(seen) = seen(&part).filter(|seen| !self.settled.contains(seen)) else { continue };
             // A restart finds the confirmation of an earlier run.

@@ -1,5 +1,5 @@
-//! The JSON objects of a vehicle's state, of a sensor's state and of a ledger: the same for the page,
-//! `clearway vehicles`, `get` and `export`.
+//! The JSON objects of a vehicle's state, of a sensor's state, of the recorder and of a ledger: the same for the page,
+//! `clearway vehicles`, `recorder`, `get` and `export`.
 
 use clearway_proto::v1;
 use serde_json::{Value, json};
@@ -23,7 +23,6 @@ pub fn sensor_json(state: &v1::SensorState) -> Value {
 /// ledger and its mount; null where a value is absent. Boot id, stamps and unknown senders are left out, because the
 /// page and people need them in different forms.
 pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
-    let recorder = vehicle.recorder.clone().unwrap_or_default();
     let sensors = vehicle.sensors.iter().map(|state| {
         let mut sensor = sensor_json(state);
         sensor["ledger"] = vehicle.sensor_ledgers.get(&state.name).map(ledger_json).into();
@@ -38,18 +37,7 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
         "sensors": sensors.collect::<Vec<_>>(),
         "ledger": ledger_json(&vehicle.ledger.clone().unwrap_or_default()),
         "observations_refused": vehicle.observations_refused,
-        "recorder": {
-            "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
-            "state": recorder.state, "reason": recorder.reason, "part": recorder.part,
-            "durable_events": recorder.durable_events,
-            "store": {
-                "confirmed": recorder.store_confirmed, "waiting": recorder.store_waiting,
-                "failures": recorder.store_failures, "problem": recorder.store_problem,
-            },
-            "topics": recorder.topics.iter().map(|of| {
-                json!({"topic": of.topic, "offered": of.offered, "written": of.written, "dropped": of.dropped})
-            }).collect::<Vec<_>>(),
-        },
+        "recorder": recorder_json(&vehicle.recorder.clone().unwrap_or_default()),
         "readers": vehicle.readers,
         "fault": (!vehicle.fault.is_empty()).then_some(&vehicle.fault),
         "state": vehicle.state,
@@ -72,6 +60,23 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
         "page": vehicle.page,
         "claimed_by": vehicle.claimed_by,
         "outline_m": vehicle.outline_m,
+    })
+}
+
+/// The state and the counts of the recorder as a JSON object: the fields of [`v1::RecorderStatus`] under their own
+/// names, those of the store in an object of their own.
+pub fn recorder_json(recorder: &v1::RecorderStatus) -> Value {
+    json!({
+        "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
+        "state": recorder.state, "reason": recorder.reason, "part": recorder.part,
+        "durable_events": recorder.durable_events,
+        "store": {
+            "confirmed": recorder.store_confirmed, "waiting": recorder.store_waiting,
+            "failures": recorder.store_failures, "problem": recorder.store_problem,
+        },
+        "topics": recorder.topics.iter().map(|of| {
+            json!({"topic": of.topic, "offered": of.offered, "written": of.written, "dropped": of.dropped})
+        }).collect::<Vec<_>>(),
     })
 }
 

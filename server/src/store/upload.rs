@@ -15,13 +15,14 @@ use serde::{Deserialize, Serialize};
 
 use super::index::Entry;
 use crate::record::mcap_reader::McapReadError;
-use crate::record::writer::confirmation_of;
+use crate::record::writer::{confirmation_of, is_being_written};
 
 /// Bytes of one piece of a part, which is sent at once. S3 allows 5 MiB or more.
 const PIECE_BYTES: usize = 8 << 20;
 /// Pieces that are sent at the same time.
 const PIECES: usize = 2;
-/// Age after which a file without closing records is no longer being written. Ours: a recorder writes each second.
+/// Age after which a file without closing records is no longer being written. Ours: a program that copies a file writes
+/// each second.
 const STILL_WRITTEN: Duration = Duration::from_secs(60);
 
 /// The store's confirmation of a part.
@@ -180,8 +181,12 @@ pub fn delete_confirmed(file: &Path) -> io::Result<bool> {
     Ok(true)
 }
 
-/// True if the file has its closing records, or if a crash has left it without them.
+/// True if no recorder writes the file, and it has its closing records or has not changed for long: a crash has left it
+/// without them. Other programs, which copy a file into the folder, hold no lock.
 fn is_finished(file: &Path) -> io::Result<bool> {
+    if is_being_written(file) {
+        return Ok(false);
+    }
     let mut opened = File::open(file)?;
     let length = opened.metadata()?.len();
     let mut end = Vec::new();

@@ -57,7 +57,7 @@ pub const UNKNOWN_SOURCE: u16 = u16::MAX;
 pub enum Cause {
     /// The event queue was full.
     Queue,
-    /// The kernel's receive buffer was full. The source of these readings is unknown.
+    /// The kernel's receive buffer was full. The source of these readings is known if the socket has only one.
     Kernel,
     /// The sender is not a sensor of the vehicle.
     Sender,
@@ -70,7 +70,7 @@ pub enum Cause {
 impl Cause {
     /// True if the source of the readings may be known; if it is not, the source is [`UNKNOWN_SOURCE`].
     pub fn has_source(self) -> bool {
-        !matches!(self, Self::Kernel | Self::Sender)
+        self != Self::Sender
     }
 }
 

@@ -31,7 +31,7 @@ pub struct Ledger {
     pub refused: BTreeMap<&'static str, u64>,
     /// Number of readings that were dropped because the event queue was full.
     pub lost: u64,
-    /// Number of datagrams that the kernel dropped; counted for the vehicle alone.
+    /// Number of datagrams that the kernel dropped. Those of a socket of several sensors count for the vehicle alone.
     pub kernel_drops: u64,
     /// Number of accepted ego poses.
     pub poses: u64,

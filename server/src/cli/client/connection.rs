@@ -15,16 +15,16 @@ const ADDRESS: &str = "localhost:50051";
 #[derive(Args)]
 pub struct ServerOptions {
     /// The server's gRPC address.
-    #[arg(long = "server", value_name = "HOST:PORT", default_value = ADDRESS, env = "CLEARWAY_SERVER")]
+    #[arg(long = "server", global = true, value_name = "HOST:PORT", default_value = ADDRESS, env = "CLEARWAY_SERVER")]
     pub address: String,
     /// PEM file with the CA certificate that signed the server's certificate; turns on encryption.
-    #[arg(long, value_name = "FILE.pem", env = "CLEARWAY_CA")]
+    #[arg(long, global = true, value_name = "FILE.pem", env = "CLEARWAY_CA")]
     ca: Option<PathBuf>,
     /// PEM file with this client's certificate, if the server requires one.
-    #[arg(long, value_name = "FILE.pem", env = "CLEARWAY_CERT", requires_all = ["ca", "key"])]
+    #[arg(long, global = true, value_name = "FILE.pem", env = "CLEARWAY_CERT", requires_all = ["ca", "key"])]
     cert: Option<PathBuf>,
     /// PEM file with the private key of --cert.
-    #[arg(long, value_name = "FILE.key", env = "CLEARWAY_KEY", requires = "cert")]
+    #[arg(long, global = true, value_name = "FILE.key", env = "CLEARWAY_KEY", requires = "cert")]
     key: Option<PathBuf>,
 }
 

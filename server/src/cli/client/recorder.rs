@@ -3,18 +3,24 @@
 use anyhow::{Error, Result};
 use clap::{Args, Subcommand};
 use clearway_proto::v1;
+use serde_json::json;
 
 use crate::cli::client::connection::ServerOptions;
 use crate::cli::shared::output::{block_on, print_line};
+use crate::status::recorder_json;
 
 /// Control the recorder of a running server: start, stop, split, save the last seconds, list, status.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway recorder status
-  clearway recorder save --seconds 60 --reason near-miss")]
+  clearway recorder save --seconds 60 --reason near-miss
+  clearway recorder list --json")]
 pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
+    /// Print one JSON object.
+    #[arg(long, global = true)]
+    json: bool,
     #[command(subcommand)]
     request: Request,
 }
@@ -50,7 +56,7 @@ pub fn run(options: Options) -> Result<()> {
     block_on(send(options))
 }
 
-async fn send(Options { server, request }: Options) -> Result<()> {
+async fn send(Options { server, json, request }: Options) -> Result<()> {
     let mut recorder = server.connect().await?.recorder().await?;
     let refused = |status: tonic::Status| Error::msg(status.message().to_owned());
     let answer = match request {
@@ -61,15 +67,17 @@ async fn send(Options { server, request }: Options) -> Result<()> {
         Request::Status => recorder.status(v1::RecordingStatusRequest {}).await,
         Request::List => {
             let parts = recorder.list(v1::ListRecordingsRequest {}).await.map_err(refused)?.into_inner().parts;
-            for part in parts {
-                let unfinished = if part.is_unfinished { ", unfinished" } else { "" };
-                print_line(&format!("{}: {} bytes{unfinished}", part.file, part.bytes))?;
-            }
-            return Ok(());
+            return print_parts(&parts, json);
         }
     };
     let v1::RecordingResponse { status, files } = answer.map_err(refused)?.into_inner();
     let status = status.unwrap_or_default();
+    if json {
+        let mut document = recorder_json(&status);
+        document["saved"] = files.into();
+        print_line(&format!("{document:#}"))?;
+        return Ok(());
+    }
     let reason = if status.reason.is_empty() { String::new() } else { format!(": {}", status.reason) };
     let file = if status.file.is_empty() { String::new() } else { format!(" {}", status.file) };
     print_line(&format!("{}{file}, part {}{reason}", status.state, status.part))?;
@@ -82,6 +90,30 @@ async fn send(Options { server, request }: Options) -> Result<()> {
     }
     for file in files {
         print_line(&format!("  saved {file}"))?;
+    }
+    Ok(())
+}
+
+fn print_parts(parts: &[v1::RecordedPart], json: bool) -> Result<()> {
+    if json {
+        let part = |part: &v1::RecordedPart| {
+            let v1::RecordedPart { file, bytes, is_unfinished, modified_ns, is_left } = part;
+            json!({
+                "file": file, "bytes": bytes, "is_unfinished": is_unfinished, "is_left": is_left,
+                "modified_ns": modified_ns,
+            })
+        };
+        let parts: Vec<_> = parts.iter().map(part).collect();
+        print_line(&format!("{:#}", json!({ "parts": parts })))?;
+        return Ok(());
+    }
+    for part in parts {
+        let state = match (part.is_left, part.is_unfinished) {
+            (true, _) => ", left unfinished by a crash",
+            (false, true) => ", unfinished",
+            (false, false) => "",
+        };
+        print_line(&format!("{}: {} bytes{state}", part.file, part.bytes))?;
     }
     Ok(())
 }

@@ -10,7 +10,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::AsFd;
 use std::thread::JoinHandle;
 
-use clearway_mapping::event::{Body, Cause};
+use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
 use nix::net::if_::if_nametoindex;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
@@ -189,11 +189,12 @@ fn receive(socket: Socket, listener: &Listener, queues: &[EventQueue], stopped: 
             batches.push(VehicleBatch { vehicle: route.vehicle, queue, readings: Vec::new() });
         }
     }
+    let of_drops = if let [only] = &listener.routes[..] { only.source } else { UNKNOWN_SOURCE };
     let mut datagrams = Vec::with_capacity(BATCH);
     while wait_readable(receiver.socket(), stopped)? {
         match receiver.receive(&mut datagrams) {
             // The destination of a datagram that the kernel dropped is unknown, so every vehicle counts it.
-            Ok(drops) => batches.iter().for_each(|batch| batch.queue.record_drop(0, Cause::Kernel, drops)),
+            Ok(drops) => batches.iter().for_each(|batch| batch.queue.record_drop(of_drops, Cause::Kernel, drops)),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => continue,
             // The error concerns one datagram (an ICMP reply, for example), not the socket.
             Err(error) => tracing::warn!(at = %listener.at, %error, "udp receive"),

@@ -2,10 +2,13 @@
 //!
 //! The parts of `drive.mcap` are `drive.mcap`, `drive.part-0002.mcap`, `drive.part-0003.mcap`, ... A part is written as
 //! `drive.unfinished.mcap` or `drive.part-0002.unfinished.mcap`, and gets its name when it is closed and on the disk.
-//! So a file without `unfinished` in its name is whole, and no file with such a name is ever written again. A crash
-//! leaves one unfinished file, which is read like any other.
+//! So a file without `unfinished` in its name is whole, and no file with such a name is ever written again.
+//!
+//! The recorder holds a lock (`flock`) of each file that it writes, and the kernel ends it with the process. So an
+//! unfinished file without a lock was left by a crash. It is read like any other, and treated as a part: it is listed
+//! as left, counts towards `keep_mb`, goes to the store, and is deleted when it is the oldest.
 
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
@@ -15,6 +18,9 @@ use mcap::McapError;
 
 use super::super::mcap_file::Disk;
 use crate::config::Recorder as Options;
+
+/// Age of an unfinished file after which it counts as left, on a file system without locks.
+const STILL_WRITTEN: Duration = Duration::from_secs(60);
 
 /// A recording cannot begin.
 #[derive(Debug, thiserror::Error)]
@@ -28,13 +34,18 @@ pub enum RecordError {
         source: io::Error,
     },
     /// The header cannot be written.
-    #[error("recording {}: {source}", file.display())]
+    #[error("recording {}: {}", file.display(), with_cause(source))]
     Write {
         /// The recording.
         file: PathBuf,
         /// The reason.
         source: McapError,
     },
+}
+
+/// The text of an error, with its cause: that of the library says that writing failed, its cause has the reason.
+pub(super) fn with_cause(error: &McapError) -> String {
+    std::error::Error::source(error).map_or(error.to_string(), |cause| format!("{error}: {cause}"))
 }
 
 /// Where the parts of a recording are written: a folder, or a simulated disk in tests.
@@ -174,9 +185,10 @@ impl Folder {
     pub(super) fn list(&self) -> Vec<v1::RecordedPart> {
         let part = |(path, bytes, modified): (PathBuf, u64, SystemTime)| {
             let since = modified.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-            let is_unfinished = path.to_string_lossy().ends_with(".unfinished.mcap");
+            let is_unfinished = is_unfinished(&path);
+            let is_left = is_unfinished && !is_being_written(&path);
             let modified_ns = i64::try_from(since.as_nanos()).unwrap_or(i64::MAX);
-            v1::RecordedPart { file: path.display().to_string(), bytes, is_unfinished, modified_ns }
+            v1::RecordedPart { file: path.display().to_string(), bytes, is_unfinished, modified_ns, is_left }
         };
         self.parts().into_iter().map(part).collect()
     }
@@ -213,6 +225,10 @@ impl Files for Folder {
             }
             file => file,
         }?;
+        // Waits only for a look of [`is_being_written`].
+        if let Err(error) = file.lock() {
+            tracing::warn!(file = %path.display(), %error, "other programs cannot see that this file is being written");
+        }
         self.sync_names()?;
         Ok(file)
     }
@@ -258,7 +274,7 @@ impl Files for Folder {
 
     fn delete_old(&mut self) {
         let mut parts = self.parts();
-        parts.retain(|(path, ..)| !path.to_string_lossy().ends_with(".unfinished.mcap"));
+        parts.retain(|(path, ..)| !is_unfinished(path) || !is_being_written(path));
         // The newest part is never deleted, however long it is.
         parts.pop();
         let mut bytes: u64 = self.parts().iter().map(|(_, bytes, _)| bytes).sum();
@@ -278,6 +294,24 @@ impl Files for Folder {
                 }
                 Err(error) => tracing::warn!(file = %path.display(), %error, "an old part cannot be deleted"),
             }
+        }
+    }
+}
+
+/// True if the name of the file says that it has no end yet.
+fn is_unfinished(path: &Path) -> bool {
+    path.to_string_lossy().ends_with(".unfinished.mcap")
+}
+
+/// True if a recorder writes the file, also that of another process.
+pub fn is_being_written(path: &Path) -> bool {
+    match File::open(path).map(|file| file.try_lock_shared()) {
+        Ok(Ok(())) => false,
+        Ok(Err(TryLockError::WouldBlock)) => true,
+        // A file system without locks: a file that has not changed for long is not being written.
+        Ok(Err(TryLockError::Error(_))) | Err(_) => {
+            let age = path.metadata().and_then(|of| of.modified()).ok().and_then(|at| at.elapsed().ok());
+            age.is_none_or(|age| age < STILL_WRITTEN)
         }
     }
 }
@@ -358,96 +392,4 @@ pub fn is_same_file(a: &Path, b: &Path) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn folder(file: &Path, replaces: bool) -> io::Result<Folder> {
-        Folder::open(&Options { file: file.to_owned(), replaces, keep_mb: 1, ..Options::default() })
-    }
-
-    #[test]
-    fn a_new_run_never_overwrites_an_earlier_recording() {
-        let temporary = tempfile::tempdir().unwrap();
-        let file = temporary.path().join("car.mcap");
-        for expected in ["car.mcap", "car-1.mcap", "car-2.mcap"] {
-            let found = next_free_name(&file);
-            assert_eq!(found, temporary.path().join(expected));
-            File::create(found).unwrap();
-        }
-        File::create(temporary.path().join("car-3.unfinished.mcap")).unwrap();
-        assert_eq!(next_free_name(&file), temporary.path().join("car-4.mcap"));
-    }
-
-    #[test]
-    fn a_part_gets_its_name_when_it_is_closed_and_replaces_no_file() {
-        let temporary = tempfile::tempdir().unwrap();
-        let at = |name: &str| temporary.path().join(name);
-        let mut parts = folder(&at("car.mcap"), false).unwrap();
-        drop(parts.create(1).unwrap());
-        assert!(at("car.unfinished.mcap").exists() && !at("car.mcap").exists());
-        assert_eq!(folder(&at("car.mcap"), false).unwrap_err().kind(), ErrorKind::AlreadyExists);
-        // Another program makes a file of that name meanwhile.
-        fs::write(at("car.mcap"), "precious").unwrap();
-        assert_eq!(parts.complete(1).unwrap_err().kind(), ErrorKind::AlreadyExists);
-        assert_eq!(fs::read(at("car.mcap")).unwrap(), b"precious");
-        assert!(at("car.unfinished.mcap").exists(), "nothing is lost");
-        let mut replacing = folder(&at("car.mcap"), true).unwrap();
-        replacing.complete(1).unwrap();
-        assert_eq!(fs::read(at("car.mcap")).unwrap(), b"");
-    }
-
-    #[test]
-    fn old_parts_are_deleted_beyond_the_size_and_saved_ones_stay() {
-        let temporary = tempfile::tempdir().unwrap();
-        let at = |name: &str| temporary.path().join(name);
-        let mut parts = folder(&at("car.mcap"), false).unwrap();
-        fs::write(at("car2.mcap"), vec![0; 3 << 20]).unwrap();
-        for part in 1..=4 {
-            drop(parts.create(part).unwrap());
-            fs::write(parts.path(part), vec![0; 400 << 10]).unwrap();
-            parts.complete(part).unwrap();
-            let time = SystemTime::UNIX_EPOCH + Duration::from_secs(part);
-            File::options().write(true).open(parts.finished(part)).unwrap().set_modified(time).unwrap();
-        }
-        let saved = parts.keep(&[1, 2], "fault").unwrap();
-        parts.delete_old();
-        let left: Vec<bool> = (1..=4).map(|part| parts.finished(part).exists()).collect();
-        assert_eq!(left, [false, false, true, true], "two parts of 400 KiB fit into 1 MiB");
-        assert!(saved.len() == 2 && saved.iter().all(|link| link.metadata().unwrap().len() == 400 << 10));
-        assert!(at("car2.mcap").exists(), "a file of another name is not a part");
-    }
-
-    #[test]
-    fn the_oldest_saves_are_deleted_beyond_the_configured_length_and_the_newest_stays() {
-        let temporary = tempfile::tempdir().unwrap();
-        let options = Options { file: temporary.path().join("car.mcap"), saved_mb: 1, ..Options::default() };
-        let mut folder = Folder::open(&options).unwrap();
-        fs::write(&options.file, vec![0; 400 << 10]).unwrap();
-        let saves = || {
-            let names = fs::read_dir(temporary.path().join("saved")).unwrap();
-            let mut names: Vec<_> = names.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
-            names.sort();
-            names
-        };
-        for name in ["1-a", "2-b", "3-c", "4-d"] {
-            folder.keep(&[1], name).unwrap();
-        }
-        assert_eq!(saves(), ["3-c", "4-d"], "each has 400 KiB");
-        fs::write(&options.file, vec![0; 2 << 20]).unwrap();
-        folder.keep(&[1], "5-e").unwrap();
-        assert_eq!(saves(), ["5-e"], "the newest stays, however long it is");
-        assert!(options.file.exists());
-    }
-
-    #[test]
-    fn a_file_is_the_same_through_every_kind_of_link() {
-        let temporary = tempfile::tempdir().unwrap();
-        let at = |name: &str| temporary.path().join(name);
-        fs::write(at("a"), "").unwrap();
-        fs::hard_link(at("a"), at("hard")).unwrap();
-        std::os::unix::fs::symlink(at("a"), at("soft")).unwrap();
-        fs::write(at("b"), "").unwrap();
-        assert!(is_same_file(&at("a"), &at("hard")) && is_same_file(&at("soft"), &at("hard")));
-        assert!(!is_same_file(&at("a"), &at("b")) && !is_same_file(&at("absent"), &at("absent")));
-    }
-}
+mod tests;

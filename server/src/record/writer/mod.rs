@@ -4,13 +4,16 @@
 //! |---|---|
 //! | `handle` | one vehicle's events and maps -> the queue; the pipeline of the vehicle's next keyframe |
 //! | `recording` | the queue -> parts on the disk |
+//! | `part` | one open part: its file, its counts |
 //! | `folder` | parts -> files: names, links of saved parts, deletion of old ones |
 //! | `counts` | what was offered, written, dropped and is durable |
 //! | `control` | requests of operators -> the recorder's thread |
 //!
-//! At least every `flush_ms` the disk is told to have everything, so a power cut costs at most that. If the queue is
-//! full or the disk fails, maps are still computed and served; what the recording lacks is counted by topic, in the
-//! status and in the recording, and a keyframe lets the maps after it be verified again.
+//! A sync begins at most half of `flush_ms` after the one before it, and at once if a message comes later than that. So
+//! a message is on the disk at most `flush_ms` after it was put on the queue, as long as a sync takes no more than the
+//! other half; if it does, the status says that the disk is too slow. If the queue is full or the disk fails, maps are
+//! still computed and served; what the recording lacks is counted by topic, in the status and in the recording, and a
+//! keyframe lets the maps after it be verified again.
 
 use std::io;
 use std::sync::Arc;
@@ -26,11 +29,15 @@ mod control;
 mod counts;
 mod folder;
 mod handle;
+mod part;
 mod recording;
 
 pub use control::{Command, ControlError, RecorderControl};
 pub use counts::{IncompleteRecordingError, RecorderCounts, RecorderState};
-pub use folder::{Files, Folder, RecordError, confirmation_of, is_same_file, next_free_name, parts_of, recording_path};
+pub use folder::{
+    Files, Folder, RecordError, confirmation_of, is_being_written, is_same_file, next_free_name, parts_of,
+    recording_path,
+};
 pub use handle::RecordingHandle;
 pub use recording::RecordingWriter;
 

@@ -14,11 +14,12 @@ use clearway_mapping::event::Event;
 use clearway_proto::v1;
 use mcap::McapError;
 
-use super::super::mcap_file::{Disk, Header, McapFile};
+use super::super::mcap_file::{Header, McapFile};
 use super::control::{Command, Request};
 use super::counts::RecorderCounts;
-use super::folder::{Files, RecordError};
+use super::folder::{Files, RecordError, with_cause};
 use super::handle::{Item, Link, RecordingHandle, WantedPart, link};
+use super::part::Part;
 use crate::config::Recorder as Options;
 use crate::encode::EncodedMap;
 
@@ -27,21 +28,6 @@ use crate::encode::EncodedMap;
 const RETRY: Duration = Duration::from_secs(1);
 /// Longest time between two looks at requests and at the time.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
-/// Time that a sync may take before the disk counts as too slow.
-const SYNC_TIME_MAX: Duration = Duration::from_secs(1);
-
-/// One open part.
-struct Part<D: Disk> {
-    number: u64,
-    file: McapFile<D>,
-    began: Instant,
-    /// Messages written and dropped, by topic.
-    topics: Vec<(u64, u64)>,
-    /// Messages written since the newest sync, by topic: what a failure of the disk costs.
-    unsynced: Vec<u64>,
-    /// True if the newest counts in the file are no longer true about what was dropped.
-    has_loss: bool,
-}
 
 /// What the writer knows about one vehicle.
 #[derive(Clone, Copy, Default)]
@@ -69,6 +55,8 @@ pub struct RecordingWriter<F: Files> {
     /// Parts that were closed, and when.
     closed: VecDeque<(u64, Instant)>,
     sync_at: Option<Instant>,
+    /// When the newest sync began; a message that waited in the queue meanwhile is no older.
+    synced_at: Instant,
     retry_at: Option<Instant>,
     is_stopped: bool,
     waits: bool,
@@ -108,6 +96,7 @@ impl<F: Files> RecordingWriter<F> {
             newest_part: 0,
             closed: VecDeque::new(),
             sync_at: None,
+            synced_at: now,
             retry_at: None,
             is_stopped: false,
             waits,
@@ -128,7 +117,8 @@ impl<F: Files> RecordingWriter<F> {
     pub(super) fn run(mut self, requests: &std::sync::mpsc::Receiver<Request>) {
         loop {
             self.counts.beat();
-            match self.items.recv_timeout(POLL_INTERVAL) {
+            let until_sync = self.sync_at.map(|at| at.saturating_duration_since(Instant::now()));
+            match self.items.recv_timeout(until_sync.unwrap_or(POLL_INTERVAL).min(POLL_INTERVAL)) {
                 Ok(item) => self.write(item, Instant::now()),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
@@ -170,7 +160,7 @@ impl<F: Files> RecordingWriter<F> {
     /// Does what has become due.
     fn tick(&mut self, now: Instant) {
         if self.sync_at.is_some_and(|at| at <= now) {
-            self.sync();
+            self.sync(now);
         }
         if self.retry_at.is_some_and(|at| at <= now) {
             self.retry_at = None;
@@ -224,7 +214,7 @@ impl<F: Files> RecordingWriter<F> {
     /// Links the parts that hold the last `seconds` into a folder of their own. Their last part ends soon after.
     fn save(&mut self, seconds: u64, reason: &str, now: Instant) -> Result<Vec<std::path::PathBuf>, String> {
         let seconds = if seconds == 0 { self.options.save_s } else { seconds };
-        self.sync();
+        self.sync(now);
         let time = Duration::from_secs(seconds);
         let closed = self.closed.iter().filter(|(_, at)| now.saturating_duration_since(*at) <= time);
         let open = self.parts.iter().map(|part| part.number);
@@ -328,7 +318,7 @@ impl<F: Files> RecordingWriter<F> {
         let Some(part) = self.parts.iter_mut().find(|part| part.number == number) else { return false };
         match write(part) {
             Ok(()) => {
-                self.sync_at.get_or_insert(now + Duration::from_millis(self.options.flush_ms));
+                self.sync_at.get_or_insert(self.synced_at + self.sync_period());
                 true
             }
             Err(error) => {
@@ -338,9 +328,14 @@ impl<F: Files> RecordingWriter<F> {
         }
     }
 
+    /// Time from the begin of a sync to the begin of the next one. The other half of `flush_ms` is for the sync itself.
+    fn sync_period(&self) -> Duration {
+        Duration::from_millis(self.options.flush_ms) / 2
+    }
+
     /// Waits until the disk has all that was written, and moves the durable mark of each vehicle.
-    fn sync(&mut self) {
-        self.sync_at = None;
+    fn sync(&mut self, now: Instant) {
+        (self.sync_at, self.synced_at) = (None, now);
         let began = Instant::now();
         let failed: Vec<(u64, McapError)> = self
             .parts
@@ -353,7 +348,7 @@ impl<F: Files> RecordingWriter<F> {
                 Err(error) => Some((part.number, error)),
             })
             .collect();
-        self.counts.set_late(began.elapsed() > SYNC_TIME_MAX);
+        self.counts.set_late(began.elapsed() > self.sync_period());
         for (number, error) in failed {
             self.abandon(number, &error, Instant::now());
         }
@@ -412,9 +407,7 @@ impl<F: Files> RecordingWriter<F> {
             vehicle.part = vehicle.part.filter(|part| *part != number);
             vehicle.warm_up = vehicle.warm_up.filter(|part| *part != number);
         }
-        // The library's error says that writing failed; its source has the reason.
-        let reason = std::error::Error::source(error).map_or(error.to_string(), |source| format!("{error}: {source}"));
-        self.fail(&reason, now);
+        self.fail(&with_cause(error), now);
     }
 
     /// Notes a failure of the disk, and when to try again.
@@ -468,33 +461,8 @@ impl<F: Files> RecordingWriter<F> {
             }
             Err(error) => {
                 self.counts.move_to_dropped(&unsynced);
-                let reason = std::error::Error::source(&error).map_or(error.to_string(), |source| source.to_string());
-                self.fail(&reason, now);
+                self.fail(&with_cause(&error), now);
             }
         }
-    }
-}
-
-impl<D: Disk> Part<D> {
-    fn add_written(&mut self, topic: usize) {
-        self.topics[topic].0 += 1;
-        self.unsynced[topic] += 1;
-    }
-
-    fn write_event(&mut self, vehicle: usize, event: &Event, journal: usize) -> Result<(), McapError> {
-        self.file.write_event(vehicle, event)?;
-        self.topics[journal].0 += 1;
-        Ok(())
-    }
-
-    /// What the part holds and lacks.
-    fn counts(&self, counts: &RecorderCounts, reason: &str, closed: bool) -> v1::RecordingCounts {
-        let topics = counts.topics().zip(&self.topics).map(|(topic, (written, dropped))| v1::TopicCount {
-            topic: topic.to_owned(),
-            offered: written + dropped,
-            written: *written,
-            dropped: *dropped,
-        });
-        v1::RecordingCounts { topics: topics.collect(), reason: reason.to_owned(), closed }
     }
 }
