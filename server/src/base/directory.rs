@@ -53,8 +53,8 @@ impl From<UnknownNameError> for tonic::Status {
 /// Finds the vehicle called `name`; an empty `name` stands for the only vehicle.
 ///
 /// # Errors
-/// [`UnknownNameError::Vehicle`] if no vehicle has the name, [`UnknownNameError::NoVehicle`] if it is empty and there is
-/// not exactly one vehicle.
+/// [`UnknownNameError::Vehicle`] if no vehicle has the name, [`UnknownNameError::NoVehicle`] if it is empty and there
+/// is not exactly one vehicle.
 pub fn find_vehicle<'a, T>(
     vehicles: &'a [T],
     name: &str,

@@ -339,7 +339,7 @@ impl VehicleStatus {
         self.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
     }
 
-    /// Records what the replay waits for in lockstep; empty: nothing. Then its data are expected anew.
+    /// Records what the replay waits for in lockstep; empty: nothing. Its data are expected from then on.
     pub(crate) fn set_replay_awaited(&self, awaited: &str) {
         let mut changing = locked(&self.changing);
         awaited.clone_into(&mut changing.replay_awaited);

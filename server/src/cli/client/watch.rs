@@ -27,8 +27,8 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps; or draw each map.
 ///
 /// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
-/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream, or if a replay ends
-/// before a map or the maps of --count have come.
+/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream, or if a
+/// replay ends before a map or the maps of --count have come.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
