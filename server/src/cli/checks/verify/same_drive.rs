@@ -48,7 +48,7 @@ impl Side {
             }
             *next_event = event.sequence.saturating_add(1);
             let Some(hash) = hash_of(&event) else { continue };
-            let newest = self.newest.entry((vehicle.clone(), event.source)).or_insert((event.arrival_ns, 0));
+            let newest = self.newest.entry((vehicle.clone(), event.source)).or_insert((i64::MIN, 0));
             let number = if newest.0 == event.arrival_ns { newest.1 + 1 } else { 0 };
             *newest = (event.arrival_ns, number);
             self.reached_ns = Some(event.arrival_ns);
