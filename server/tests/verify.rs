@@ -178,6 +178,39 @@ fn recordings_without_a_map_in_common_are_not_compared() {
 }
 
 #[test]
+fn another_drive_with_the_same_stamps_is_not_compared_as_if_it_were_a_change() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    let made = |arguments: &[&str]| {
+        let output = clearway(arguments);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+    };
+    for (scene, name) in [("street", "a"), ("slopes", "b")] {
+        let (capture, drive) = (at(&format!("{name}.pcap")), at(&format!("{name}.mcap")));
+        made(&["simulate", scene, "--sensor", "vlp16", "--seconds", "0.5", "--out", &capture]);
+        made(&["replay", &capture, "--record", &drive]);
+    }
+    let (code, report) = verified(&[&at("a.mcap"), "--against", &at("b.mcap")]);
+    let reason = report["files"][0]["not_checked"].as_str().unwrap_or_default();
+    assert!(code == 2 && reason.contains("b.mcap are different drives: of "), "{report:#}");
+    // The same drive with other maps still compares.
+    made(&["replay", &at("a.mcap"), "--set", "vehicle.maps.reach.vehicle_width_m=2.6", "--record", &at("wide.mcap")]);
+    let (code, report) = verified(&[&at("a.mcap"), "--against", &at("wide.mcap")]);
+    assert_eq!(code, 1, "{report:#}");
+}
+
+#[test]
+fn a_report_is_written_when_no_file_matches() {
+    let folder = tempfile::tempdir().unwrap();
+    let report = folder.path().join("verify.xml").display().to_string();
+    let pattern = format!("{}/*.mcap", folder.path().display());
+    let (code, json) = verified(&[&pattern, "--junit", &report]);
+    let junit = fs::read_to_string(report).unwrap();
+    assert_eq!((code, &json["ok"]), (2, &false.into()));
+    assert!(junit.contains("errors=\"1\"") && junit.contains("no file matches this pattern"), "{junit}");
+}
+
+#[test]
 fn the_sum_counts_a_file_that_is_cut_apart_from_those_that_are_not_checked() {
     let folder = tempfile::tempdir().unwrap();
     let cut = folder.path().join("cut.mcap");

@@ -58,6 +58,7 @@ async fn the_tests_of_the_python_client_pass_against_running_servers() {
         ("CLEARWAY_SECURED_ZENOH", routed),
         ("CLEARWAY_CERTIFICATES", certificates("ours").display().to_string()),
         ("CLEARWAY_RECORDING", recording.display().to_string()),
+        ("CLEARWAY", clearway_tests::binaries().join("clearway").display().to_string()),
     ];
     let tests = tokio::task::spawn_blocking(move || {
         let tests = Path::new(REPOSITORY).join("client/python/tests");

@@ -253,32 +253,40 @@ async fn in_lockstep_a_reader_gets_every_map_and_one_that_never_acknowledges_is_
     let drive = recorded_drive(folder.path(), 8).await;
     let maps = recorded_maps(&drive).len();
     let options = Options { lockstep: true, exit_at_end: true, wait_readers: Some(1), ..served(&drive) };
-    let reads = async |address: String, acknowledges: bool| {
+    async fn reads(address: String, acknowledges: bool) -> (Vec<u64>, String) {
         let mut service = v1::map_service_client::MapServiceClient::connect(format!("http://{address}")).await.unwrap();
         let (requests, stream) = tokio::sync::mpsc::channel(8);
         requests.send(fixture::selection("", &["drivability"], 1)).await.unwrap();
         let stream = tokio_stream::wrappers::ReceiverStream::new(stream);
         let mut updates = service.watch(stream).await.unwrap().into_inner();
         let mut sequences = Vec::new();
-        while let Ok(Some(update)) = updates.message().await {
-            if update.replay_ended {
-                break;
-            }
+        let why = loop {
+            let update = match updates.message().await {
+                Ok(Some(update)) if !update.replay_ended => update,
+                Ok(_) => break String::new(),
+                Err(status) => break status.message().to_owned(),
+            };
             sequences.push(fixture::sequence(&update.map));
             let acknowledged = sequences.last().copied();
             if acknowledges {
                 requests.send(v1::WatchRequest { acknowledged, ..Default::default() }).await.unwrap();
             }
-        }
-        sequences
-    };
-    let (summary, sequences) = replayed(options.clone(), |address| reads(address, true)).await;
+        };
+        (sequences, why)
+    }
+    let (summary, read) = replayed(options.clone(), |address| reads(address, true)).await;
     assert!(summary.unwrap().reached_end);
-    assert_eq!(sequences.unwrap(), (0..maps as u64).collect::<Vec<_>>());
+    assert_eq!(read.unwrap(), ((0..maps as u64).collect(), String::new()));
 
     let options = Options { lockstep_timeout: Some(0.2), ..options };
-    let (summary, _) = replayed(options, |address| reads(address, false)).await;
+    // The reader outlives the replay.
+    let (send_read, read) = tokio::sync::oneshot::channel();
+    let test = async move |address| drop(tokio::spawn(async move { send_read.send(reads(address, false).await) }));
+    let (summary, _) = replayed(options, test).await;
     let error = summary.unwrap_err().to_string();
+    let (sequences, why) = within("the reader's end", read).await.unwrap();
+    assert_eq!(sequences, [0]);
+    assert!(why.contains(&error), "the reader is told why: {why}");
     let named = "map 0 of vehicle car was not acknowledged within 0.2 s; awaited: gRPC reader of drivability";
     assert!(error.contains(named), "{error}");
 }
@@ -302,6 +310,9 @@ async fn while_a_step_waits_for_an_acknowledgement_the_state_says_so_and_a_seek_
             }
         };
         assert_eq!(awaited, "the acknowledgement of map 0 of vehicle car by any reader that acknowledges");
+        let status = Client::connect(&address).await.unwrap().vehicles().await.unwrap().remove(0);
+        let waits = status.reasons.contains(&format!("the replay waits for {awaited}"));
+        assert!(waits && status.state != "error", "{}: {:?}", status.state, status.reasons);
         let request = v1::ReplayControl { seek_ns: Some(recorded[3].0), ..Default::default() };
         let state = transport.control(request).await.unwrap().into_inner();
         assert_eq!((state.phase(), state.position_ns), (v1::ReplayPhase::Paused, recorded[3].0));
@@ -309,6 +320,27 @@ async fn while_a_step_waits_for_an_acknowledgement_the_state_says_so_and_a_seek_
         assert_eq!(stepped.await.unwrap().jumps, 1, "the step is over when the seek is made");
     };
     let (summary, tested) = replayed(Options { paused: true, ..served(&drive) }, test).await;
+    tested.expect("the test ran");
+    summary.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_drive_opened_at_a_moment_stands_there_between_its_whole_begin_and_end_and_is_no_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = recorded_drive(folder.path(), 8).await;
+    let test = async |address: String| {
+        let client = Client::connect(&address).await.unwrap();
+        let step = v1::ReplayControl { step: Some(1), ..Default::default() };
+        let state = client.replay_control(step).await.unwrap();
+        assert_eq!((state.from_ns, state.to_ns), (state.begin_ns, state.end_ns));
+        assert!(state.position_ns > state.begin_ns + 400_000_000, "{state:?}");
+        let back = v1::ReplayControl { seek_ns: Some(state.begin_ns + 200_000_000), ..Default::default() };
+        assert_eq!(client.replay_control(back).await.unwrap().phase(), v1::ReplayPhase::Paused);
+        let status = client.vehicles().await.unwrap().remove(0);
+        assert!(status.state == "warn" && status.reasons[0] == "the replay is paused", "{:?}", status.reasons);
+        assert!(status.map_age_ms.unwrap() < 60_000.0, "by the replay's clock: {:?} ms", status.map_age_ms);
+    };
+    let (summary, tested) = replayed(Options { paused: true, seek: Some(0.4), ..served(&drive) }, test).await;
     tested.expect("the test ran");
     summary.unwrap();
 }
@@ -391,7 +423,10 @@ async fn recordings_of_two_vehicles_run_in_one_time() {
     let both = folder.path().join("both.mcap");
     let options = Options { files: vec![car.clone(), van.clone()], record: Some(both.clone()), ..Options::default() };
     let (summary, _) = replayed(options, async |_| {}).await;
-    assert!(summary.unwrap().notes.iter().any(|note| note.starts_with("vehicle van: ")));
+    let summary = summary.unwrap();
+    let text = summary.to_text();
+    assert!(text.contains("vehicle car\n") && text.contains("vehicle van\n"), "{text}");
+    assert!(summary.others[0].0 == "van" && summary.others[0].1.maps > 0, "{text}");
     let report = verify(&both).unwrap();
     assert!(report.is_good(), "{:?}", report.differences);
     assert_eq!(report.maps as usize, recorded_maps(&car).len() + recorded_maps(&van).len());

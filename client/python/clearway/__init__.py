@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from os import PathLike
 
 from . import over_grpc, over_zenoh
-from .errors import ClearwayError, DecodeError
+from .errors import ClearwayError, DecodeError, ReplayEnded
 from .freshness import now_ns
 from .grid import CartesianGrid, RadialGrid
 from .map import Channel, Layer, LegendEntry, Map, Meaning, Obstacle, SafePoint

@@ -12,5 +12,13 @@ class ClearwayError(Exception):
         self.reason = reason
 
 
+class ReplayEnded(ClearwayError):
+    """The replay that the server serves has reached its end, and its last map was returned. The stream goes on:
+    further maps come if the replay is set back."""
+
+    def __init__(self) -> None:
+        super().__init__("replay_ended", "the replay has ended")
+
+
 class DecodeError(ClearwayError):
     """An invalid map. `reason` is the name in the golden vectors, the same in every client language."""

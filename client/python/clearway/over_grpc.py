@@ -43,7 +43,7 @@ def _service(address: str, tls: Tls | None) -> tuple[grpc.Channel, service_pb2_g
     return channel, service_pb2_grpc.MapServiceStub(channel)
 
 
-def _refused(address: str, error: grpc.RpcError) -> ClearwayError:
+def refused(address: str, error: grpc.RpcError) -> ClearwayError:
     return ClearwayError(error.code().name, f"{address}: {error.details()}")
 
 
@@ -58,7 +58,7 @@ def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
         try:
             return list(service.ListVehicles(service_pb2.ListVehiclesRequest(), timeout=_TIMEOUT_S).vehicles)
         except grpc.RpcError as error:
-            raise _refused(address, error) from None
+            raise refused(address, error) from None
 
 
 def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> Map:
@@ -68,11 +68,11 @@ def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> M
     except grpc.RpcError as error:
         server = _led_to(error)
         if server is None:
-            raise _refused(address, error) from None
+            raise refused(address, error) from None
     try:
         return _get(server, request, tls)
     except grpc.RpcError as error:
-        raise _refused(server, error) from None
+        raise refused(server, error) from None
 
 
 def _get(address: str, request: service_pb2.GetMapRequest, tls: Tls | None) -> Map:
@@ -110,7 +110,7 @@ def watch(
         except grpc.RpcError as error:
             server = _led_to(error) if may_be_led else None
             if server is None:
-                stream.end(_refused(at, error))
+                stream.end(refused(at, error))
                 return
             of.close()
             opened.append(_Watch(server, selection, tls))

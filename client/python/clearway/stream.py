@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from .errors import ClearwayError
+from .errors import ClearwayError, ReplayEnded
 from .freshness import POLL_INTERVAL_S, Clock
 from .map import Map
 
@@ -79,13 +79,19 @@ class MapStream:
         """Waits for a map newer than the last one returned, which counts as handled: a replay in lockstep goes on then.
         Raises the reason if the stream has ended; stops when
         closed, and once after the last map of a replay: iterate again for the maps of a replay that is set back."""
-        return self._next(report_stale=False)
+        try:
+            return self._next(report_stale=False)
+        except ReplayEnded:
+            raise StopIteration from None
 
     def next_or_stale(self) -> Map:
         """Waits for a map newer than the last one returned, or until that one is stale. A stale map is returned again,
         once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. Raises the reason if the
-        stream has ended, and `StopIteration` at the end of a replay and when closed."""
-        return self._next(report_stale=True)
+        stream has ended: `ReplayEnded` at the end of a replay, `ClearwayError` of reason "closed" when closed."""
+        try:
+            return self._next(report_stale=True)
+        except StopIteration:
+            raise ClearwayError("closed", "the stream is closed") from None
 
     def _next(self, *, report_stale: bool) -> Map:
         with self._changed:
@@ -103,7 +109,7 @@ class MapStream:
             newest = self._newest
             if self.replay_ended and not self._is_unseen():
                 self._replay_ends_seen = self._replay_ends
-                raise StopIteration
+                raise ReplayEnded
             if newest is None or not self._is_unseen():
                 assert self._ended is not None
                 raise self._ended

@@ -3,7 +3,13 @@
 /// A request names a vehicle, sensor or layer that does not exist.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum UnknownNameError {
-    /// No vehicle has this name, or the name is empty and there is not exactly one vehicle.
+    /// No vehicle is named, and there is not exactly one.
+    #[error("no vehicle is named: choose one of {known}")]
+    NoVehicle {
+        /// The names of all vehicles, separated by commas.
+        known: String,
+    },
+    /// No vehicle has this name.
     #[error("vehicle {name:?} is not known; known: {known}")]
     Vehicle {
         /// The requested name.
@@ -36,7 +42,9 @@ pub enum UnknownNameError {
 impl From<UnknownNameError> for tonic::Status {
     fn from(error: UnknownNameError) -> Self {
         match error {
-            UnknownNameError::Vehicle { .. } | UnknownNameError::Sensor { .. } => Self::not_found(error.to_string()),
+            UnknownNameError::NoVehicle { .. } | UnknownNameError::Vehicle { .. } | UnknownNameError::Sensor { .. } => {
+                Self::not_found(error.to_string())
+            }
             UnknownNameError::Layer { .. } => Self::invalid_argument(error.to_string()),
         }
     }
@@ -45,7 +53,8 @@ impl From<UnknownNameError> for tonic::Status {
 /// Finds the vehicle called `name`; an empty `name` stands for the only vehicle.
 ///
 /// # Errors
-/// [`UnknownNameError::Vehicle`] if no vehicle has the name, or if it is empty and there is not exactly one vehicle.
+/// [`UnknownNameError::Vehicle`] if no vehicle has the name, [`UnknownNameError::NoVehicle`] if it is empty and there
+/// is not exactly one vehicle.
 pub fn find_vehicle<'a, T>(
     vehicles: &'a [T],
     name: &str,
@@ -56,7 +65,11 @@ pub fn find_vehicle<'a, T>(
     }
     vehicles.iter().find(|vehicle| name_of(vehicle) == name).ok_or_else(|| {
         let known: Vec<&str> = vehicles.iter().map(name_of).collect();
-        UnknownNameError::Vehicle { name: name.to_owned(), known: known.join(", ") }
+        let known = known.join(", ");
+        match name {
+            "" => UnknownNameError::NoVehicle { known },
+            name => UnknownNameError::Vehicle { name: name.to_owned(), known },
+        }
     })
 }
 
@@ -70,7 +83,7 @@ mod tests {
         assert_eq!(find(&["car"], "").unwrap(), "car");
         assert_eq!(find(&["car", "van"], "van").unwrap(), "van");
         let error = find(&["car", "van"], "").unwrap_err();
-        assert_eq!(error.to_string(), "vehicle \"\" is not known; known: car, van");
+        assert_eq!(error.to_string(), "no vehicle is named: choose one of car, van");
         assert!(find(&["car"], "van").is_err());
     }
 }

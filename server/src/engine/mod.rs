@@ -192,7 +192,8 @@ impl Engine {
         self.update_status();
         if let Some((encoded, states)) = encoded {
             let total = duration(now_ns().saturating_sub(encoded.capture_end_ns));
-            let is_shifted = self.replayed.is_some();
+            // A jump of a replay as recorded has a header of its own too, with the recorded stamps.
+            let is_shifted = self.replayed.is_some_and(|replayed| replayed.shift_ns != 0);
             // The stamps of a recording say nothing of this run.
             let is_live = !is_shifted && !self.status.is_from_files();
             self.status.mapped(MadeMap {

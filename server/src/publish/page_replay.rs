@@ -123,6 +123,32 @@ impl PageRequest {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::replay::control::Command;
+
+    #[tokio::test]
+    async fn a_step_that_waits_holds_up_no_request_after_it() {
+        let (handle, mut input) = ReplayHandle::new(v1::ReplayState::default());
+        let mut page = Some(PageReplay { handle, may_control: true, pending: FuturesUnordered::new() });
+        for request in [r#"{"step":1}"#, r#"{"paused":true}"#] {
+            page.as_mut().unwrap().begin(&serde_json::from_str(request).unwrap());
+        }
+        let answers = async {
+            let mut step = None;
+            while let Some(Command::Change(request, outcome)) = input.commands.recv().await {
+                if request.step.is_some() {
+                    step = Some(outcome);
+                } else {
+                    let paused = v1::ReplayState { jumps: 7, ..Default::default() };
+                    outcome.send(Ok(paused)).unwrap();
+                    // The step is still owed.
+                    return step;
+                }
+            }
+            None
+        };
+        let (answer, step) = tokio::join!(replay_answered(&mut page), answers);
+        assert!(answer.contains("\"jumps\":7") && step.is_some(), "{answer}");
+    }
 
     #[test]
     fn a_request_of_the_page_is_read_whole_or_refused() {

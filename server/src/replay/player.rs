@@ -143,8 +143,9 @@ impl Player {
         if self.await_readers()?.is_err() {
             return Ok(Err(Stopped));
         }
-        if self.state.from_ns > self.state.begin_ns {
-            self.jump(self.state.from_ns, false)?;
+        let first_ns = self.state.position_ns.max(self.state.from_ns);
+        if first_ns > self.state.begin_ns {
+            self.jump(first_ns, false)?;
         }
         loop {
             match self.state.phase() {
@@ -205,7 +206,7 @@ impl Player {
         self.note_delay(due.map_or(Duration::ZERO, |due| now.saturating_duration_since(due)));
         let has_command = !self.input.commands.is_empty();
         if left > EXACT || has_command {
-            // The last part is slept exactly when this is called again.
+            // The last part is slept exactly.
             let until = Instant::now() + left.saturating_sub(EXACT / 2).min(POLL);
             let stopped = self.wait(until)?;
             self.step_waiting(None);
@@ -431,8 +432,7 @@ impl Player {
         }
         self.awaited = None;
         self.state.awaited.clear();
-        while let Some(at_ns) = self.readings.next_ns()?.filter(|at_ns| *at_ns <= to_ns) {
-            debug_assert!(at_ns <= to_ns);
+        while self.readings.next_ns()?.is_some_and(|at_ns| at_ns <= to_ns) {
             let Some(vehicle) = self.push_next()? else { break };
             let ReplayedVehicle { engine, events, .. } = &mut self.vehicles[vehicle];
             let before = engine.maps();
@@ -481,6 +481,9 @@ impl Player {
         self.reported = Instant::now();
         self.state.maps = self.vehicles.iter().map(|vehicle| vehicle.engine.maps()).collect();
         self.input.state.send_if_modified(|state| {
+            if state.awaited != self.state.awaited {
+                self.vehicles.iter().for_each(|of| of.engine.status.set_replay_awaited(&self.state.awaited));
+            }
             let changed = *state != self.state;
             state.clone_from(&self.state);
             changed

@@ -76,12 +76,14 @@ impl VehicleStatus {
         self.health_state.send_if_modified(|last| std::mem::replace(last, state) != state);
         drop(health);
         let changing = locked(&self.changing);
-        let age_ns = now_ns().saturating_sub(changing.newest_capture_end_ns);
+        let by_clock_ms = now_ns().saturating_sub(changing.newest_capture_end_ns) as f64 / 1e6;
+        // The stamp of a recorded map says nothing about now.
+        let by_arrival_ms = facts.map_age.filter(|_| changing.has_recorded_stamps).map(|age| age.as_secs_f64() * 1e3);
         let is_made = changing.maps > 0 && self.started.elapsed().saturating_sub(changing.mapped_at) <= SILENT_AFTER;
         Assessment {
             state,
             reasons,
-            map_age_ms: (changing.maps > 0).then_some(age_ns as f64 / 1e6),
+            map_age_ms: (changing.maps > 0).then_some(by_arrival_ms.unwrap_or(by_clock_ms)),
             loss: facts.loss,
             speed_m_s: changing.speed_m_s.filter(|_| is_made),
             claimed_by: facts.claimed_by,
@@ -125,6 +127,7 @@ impl VehicleStatus {
             validity: changing.validity,
             has_recorded_stamps: changing.has_recorded_stamps,
             replay: changing.replay.map(|(phase, at)| (phase, up.saturating_sub(at))),
+            replay_awaited: changing.replay_awaited.clone(),
             sensors: changing.sensors.iter().map(|sensor| sensor_facts(sensor, &changing, up)).collect(),
             loss,
             recorder_problem: self.recorder_problem(),

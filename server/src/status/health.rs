@@ -67,6 +67,8 @@ pub struct Facts {
     pub has_recorded_stamps: bool,
     /// Phase of the replay that makes the maps, and since when it lasts; `None` if they are made live.
     pub replay: Option<(ReplayPhase, Duration)>,
+    /// What the replay waits for in lockstep; empty: nothing.
+    pub replay_awaited: String,
     /// The sensors.
     pub sensors: Vec<SensorFacts>,
     /// Share of the packets of the last 10 s that were lost or refused, 0 to 1.
@@ -180,18 +182,21 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
 }
 
 /// Why a replay stands still; `None` if it plays, or nothing is replayed.
-fn standing(facts: &Facts) -> Option<&'static str> {
+fn standing(facts: &Facts) -> Option<String> {
+    let awaited = &facts.replay_awaited;
     match facts.replay?.0 {
-        ReplayPhase::Waiting => Some("the replay waits for readers"),
-        ReplayPhase::Paused => Some("the replay is paused"),
-        ReplayPhase::Ended => Some("the replay has ended"),
+        ReplayPhase::Waiting => Some("the replay waits for readers".to_owned()),
+        ReplayPhase::Paused => Some("the replay is paused".to_owned()),
+        ReplayPhase::Ended => Some("the replay has ended".to_owned()),
+        ReplayPhase::Playing if !awaited.is_empty() => Some(format!("the replay waits for {awaited}")),
         ReplayPhase::Playing | ReplayPhase::Unspecified => None,
     }
 }
 
 /// True if packets and maps are expected: of live sensors, and of a replay that has played for a while.
 fn expects_data(facts: &Facts) -> bool {
-    facts.replay.is_none_or(|(phase, since)| phase == ReplayPhase::Playing && since > SILENT_AFTER)
+    let plays = |(_, since)| standing(facts).is_none() && since > SILENT_AFTER;
+    facts.replay.is_none_or(plays)
 }
 
 /// Sensors of which nothing arrives. One of several is a warning, because the others make maps.
@@ -223,9 +228,9 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
     if !facts.makes_maps {
         return;
     }
-    if let Some(why) = standing(facts) {
-        add(State::Warn, why.to_owned());
-    }
+    let standing = standing(facts);
+    let stands = standing.is_some();
+    standing.into_iter().for_each(|why| add(State::Warn, why));
     let Some(age) = facts.map_age else {
         if expects_data(facts) {
             add(State::Error, "no map yet".to_owned());
@@ -237,7 +242,8 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
     }
     // A map with the stamp of the recording does not age while the replay stands still.
     if age > facts.validity && (expects_data(facts) || !facts.has_recorded_stamps) {
-        let is_long = age > facts.validity + STALE_ERROR_AFTER;
+        // A replay that stands still does what it was asked to do.
+        let is_long = !stands && age > facts.validity + STALE_ERROR_AFTER;
         let state = if is_long { State::Error } else { State::Warn };
         add(state, format!("the newest map is {} old, and valid for {}", seconds(age), seconds(facts.validity)));
     }
@@ -382,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn a_replay_that_stands_still_is_a_warning_until_its_maps_are_stale_as_live() {
+    fn a_replay_that_stands_still_is_a_warning_and_says_what_it_waits_for() {
         let never = SensorFacts { silent: None, completeness: None, ..sensor("top", 0) };
         let in_phase = |phase, since_ms| Some((phase, ms(since_ms)));
         let replay = in_phase(ReplayPhase::Waiting, 9000);
@@ -393,7 +399,12 @@ mod tests {
         let replay = in_phase(ReplayPhase::Paused, 9000);
         let paused = Facts { replay, map_age: Some(ms(9000)), sensors: vec![sensor("top", 9000)], ..fine() };
         let old = "the newest map is 9.0 s old, and valid for 0.3 s".to_owned();
-        assert_eq!(words(&paused), [("error", old), ("warn", "the replay is paused".to_owned())]);
+        assert_eq!(words(&paused), [("warn", "the replay is paused".to_owned()), ("warn", old.clone())]);
+        let (replay, replay_awaited) =
+            (in_phase(ReplayPhase::Playing, 9000), "the acknowledgement of map 3".to_owned());
+        let awaiting = Facts { replay, replay_awaited, ..paused.clone() };
+        let waits = "the replay waits for the acknowledgement of map 3".to_owned();
+        assert_eq!(words(&awaiting), [("warn", waits), ("warn", old)]);
         let as_recorded = Facts { has_recorded_stamps: true, ..paused };
         assert!(words(&as_recorded).iter().all(|(state, _)| *state == "warn"), "{:?}", words(&as_recorded));
         let resumed = Facts { replay: in_phase(ReplayPhase::Playing, 100), ..as_recorded.clone() };

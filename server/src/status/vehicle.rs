@@ -100,6 +100,8 @@ pub(super) struct Changing {
     pub(super) has_recorded_stamps: bool,
     /// Phase of the replay that makes the maps, and since when after `started`; `None` if they are made live.
     pub(super) replay: Option<(v1::ReplayPhase, Duration)>,
+    /// What the replay waits for in lockstep; empty: nothing.
+    pub(super) replay_awaited: String,
     drivable_share: Option<f64>,
     pub(super) window: Window,
     /// Time of all maps by stage, in the order of [`STAGES`].
@@ -335,6 +337,13 @@ impl VehicleStatus {
         locked(&self.changing).replay = Some((phase, self.started.elapsed()));
         let ended = phase == v1::ReplayPhase::Ended;
         self.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
+    }
+
+    /// Records what the replay waits for in lockstep; empty: nothing. Its data are expected from then on.
+    pub(crate) fn set_replay_awaited(&self, awaited: &str) {
+        let mut changing = locked(&self.changing);
+        awaited.clone_into(&mut changing.replay_awaited);
+        changing.replay = changing.replay.map(|(phase, _)| (phase, self.started.elapsed()));
     }
 
     /// Records that the engine has stopped.

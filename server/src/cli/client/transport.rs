@@ -16,6 +16,8 @@ use crate::cli::shared::output::{block_on, print_line};
   clearway transport pause
   clearway transport seek 12.5
   clearway transport step 3
+  clearway transport range 2 5
+  clearway transport range --all
   clearway transport rate max")]
 pub struct Options {
     #[command(subcommand)]
@@ -46,12 +48,17 @@ enum Request {
         #[arg(allow_negative_numbers = true)]
         seconds: f64,
     },
-    /// Play only this part.
+    /// Play only this part; --all plays the whole drive again.
     Range {
         /// Begin, in seconds after the first event.
-        from: f64,
+        #[arg(required_unless_present = "all", allow_negative_numbers = true)]
+        from: Option<f64>,
         /// End, in seconds after the first event.
-        to: f64,
+        #[arg(required_unless_present = "all", allow_negative_numbers = true)]
+        to: Option<f64>,
+        /// The whole drive.
+        #[arg(long, conflicts_with_all = ["from", "to"])]
+        all: bool,
     },
     /// Set the speed: 0.1 to 1000 times the recorded one, or max.
     Rate {
@@ -118,7 +125,10 @@ impl Request {
             Self::Pause => ReplayControl { paused: Some(true), ..nothing },
             Self::Step { maps } => ReplayControl { step: Some(maps), ..nothing },
             Self::Seek { seconds } => ReplayControl { seek_ns: at(seconds)?, ..nothing },
-            Self::Range { from, to } => ReplayControl { from_ns: at(from)?, to_ns: at(to)?, ..nothing },
+            Self::Range { from: Some(from), to: Some(to), .. } => {
+                ReplayControl { from_ns: at(from)?, to_ns: at(to)?, ..nothing }
+            }
+            Self::Range { .. } => ReplayControl { from_ns: Some(state.begin_ns), to_ns: Some(state.end_ns), ..nothing },
             Self::Rate { rate } => ReplayControl { rate: Some(rate.rate()), ..nothing },
             Self::Loop { on } => ReplayControl { repeat: Some(on), ..nothing },
             Self::Lockstep { on } => ReplayControl { lockstep: Some(on), ..nothing },

@@ -15,7 +15,7 @@ use crate::cli::client::screen::Screen;
 use crate::cli::shared::exit::Exit;
 #[cfg(feature = "zenoh")]
 use crate::cli::shared::files;
-use crate::cli::shared::output::{block_on, print_line, usage_error};
+use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
 
 /// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
 const STALE_PERIOD: Duration = Duration::from_secs(1);
@@ -27,7 +27,8 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps; or draw each map.
 ///
 /// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
-/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream.
+/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream, or if a
+/// replay ends before a map or the maps of --count have come.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
@@ -66,7 +67,7 @@ pub struct Options {
     /// With --draw: distance from the vehicle to the edge, in metres; the whole grid if absent.
     #[arg(long, value_name = "METRES", requires = "draw")]
     range: Option<f64>,
-    /// End after this many maps; at Ctrl-C if absent.
+    /// End after this many maps; at Ctrl-C if absent. If a replay ends before, the exit code is 2.
     #[arg(long, value_name = "MAPS")]
     count: Option<u64>,
     /// End with exit code 4 as soon as the map is stale, or none has come for a second.
@@ -110,6 +111,11 @@ async fn watch(options: &Options) -> Result<Exit> {
             }
             Ok(Err(error @ ClientError::ReplayEnded { .. })) => {
                 eprintln!("clearway: {error}");
+                let wanted = options.count.unwrap_or(1);
+                if printed < wanted {
+                    eprintln!("clearway: {printed} of {} came before the replay ended", counted(wanted, "map"));
+                    return Ok(Exit::Unreadable);
+                }
                 break;
             }
             Ok(Err(ended)) => {

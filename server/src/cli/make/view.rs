@@ -20,7 +20,7 @@ pub struct Options {
     /// Recordings, captures, or folders of them, as of `clearway replay`.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Begin this many seconds after the first event.
+    /// Stand at this many seconds after the first event; the whole drive is in the time bar.
     #[arg(long, value_name = "SECONDS", value_parser = replay::options::offset)]
     from: Option<f64>,
     /// Open the page with the browser of the desktop (xdg-open).
@@ -35,6 +35,6 @@ pub struct Options {
 pub fn run(options: Options) -> Result<Exit> {
     let Options { files, from, open } = options;
     let replayed =
-        replay::Options { files, from, serve: true, any_port: true, paused: true, ..replay::Options::default() };
+        replay::Options { files, seek: from, serve: true, any_port: true, paused: true, ..replay::Options::default() };
     replay::view(replayed, open)
 }

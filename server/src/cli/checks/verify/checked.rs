@@ -59,6 +59,12 @@ pub enum Outcome {
 }
 
 impl Checked {
+    /// The result of files, patterns and stores that name no recording.
+    pub fn not_found(given: &[String], reason: String) -> Self {
+        let (file, outcome) = (given.join(" ").into(), Outcome::Unreadable(reason));
+        Self { file, seconds: 0.0, outcome, pictures: Vec::new() }
+    }
+
     /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole or
     /// has no event, else [`Exit::Good`].
     pub fn exit(&self) -> Exit {
@@ -136,6 +142,7 @@ fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
     Ok(match check {
         Check::Verify => Outcome::Verified(verify(file)?),
         Check::Against { other, worst } => {
+            super::same_drive::check(file, other)?;
             let comparison = compare(file, &After::Recording(other), *worst)?;
             if comparison.layers.values().all(|layer| layer.maps == 0) {
                 bail!(

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `files` | paths and patterns of the command line, a shard -> files |
 //! | `checked` | files -> the result of each, several at a time |
+//! | `same_drive` | two recordings -> whether they are of one drive |
 //! | `table` | results -> text |
 //! | `report` | results -> JSON, JUnit XML |
 //! | `pictures` | the maps that changed most -> pictures |
@@ -25,6 +26,7 @@ mod checked;
 mod files;
 mod pictures;
 mod report;
+mod same_drive;
 mod table;
 
 /// Compute every map of recordings again from their events, and name the first differences.
@@ -33,7 +35,7 @@ mod table;
 #[derive(Args)]
 #[command(
     after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
-no event, or no map in common with that of --against, 3 wrong use.
+no event, or is another drive than that of --against or has no map in common with it, 3 wrong use.
 
 Examples:
   clearway verify drive.mcap
@@ -111,15 +113,12 @@ pub fn run(options: &Options) -> Result<Exit> {
     if let (Some(_), Check::Verify) = (&options.change.pictures, &check) {
         return Err(crate::cli::shared::output::usage_error("--pictures needs --config, --set or --against"));
     }
-    let files = match files::find(&options.files, options.shard) {
-        Ok(files) => files,
-        Err(error) => {
-            eprintln!("clearway: {error:#}");
-            return Ok(Exit::Unreadable);
-        }
-    };
     let jobs = options.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
-    let mut results = checked::check_all(&files, &check, jobs);
+    let mut results = match files::find(&options.files, options.shard) {
+        Ok(files) => checked::check_all(&files, &check, jobs),
+        // In the reports too: a machine that collects them has to find the reason.
+        Err(error) => vec![Checked::not_found(&options.files, format!("{error:#}"))],
+    };
     if let Some(folder) = &options.change.pictures {
         one_file::create_folder(folder)?;
         results.iter_mut().try_for_each(|result| pictures::draw(result, folder))?;

@@ -65,20 +65,23 @@ pub fn follow(replay: ReplayHandle, runtime: Handle) {
         return;
     }
     eprintln!("{KEYS}");
-    let read = move || {
-        for line in std::io::stdin().lock().lines().map_while(Result::ok) {
-            let state = replay.state().borrow().clone();
-            match key(&line, &state) {
-                None => eprintln!("{KEYS}"),
-                Some(Key::State) => eprintln!("{}", describe(&state)),
-                Some(Key::Quit) => replay.stop(),
-                // A step waits for its maps; the next key does not.
-                Some(Key::Control(request)) => drop(runtime.spawn(control(replay.clone(), request))),
-            }
-        }
-    };
+    let read = move || obey(std::io::stdin().lock(), &replay, &runtime);
     if let Err(error) = std::thread::Builder::new().name("keys".to_owned()).spawn(read) {
         tracing::warn!(%error, "no thread for the keys");
+    }
+}
+
+/// Does what each line asks for.
+fn obey(lines: impl BufRead, replay: &ReplayHandle, runtime: &Handle) {
+    for line in lines.lines().map_while(Result::ok) {
+        let state = replay.state().borrow().clone();
+        match key(&line, &state) {
+            None => eprintln!("{KEYS}"),
+            Some(Key::State) => eprintln!("{}", describe(&state)),
+            Some(Key::Quit) => replay.stop(),
+            // A step waits for its maps; the next key does not.
+            Some(Key::Control(request)) => drop(runtime.spawn(control(replay.clone(), request))),
+        }
     }
 }
 
@@ -93,6 +96,23 @@ async fn control(replay: ReplayHandle, request: ReplayControl) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::replay::control::Command;
+
+    #[test]
+    fn a_step_that_waits_holds_up_no_key_after_it() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let (replay, mut input) = ReplayHandle::new(ReplayState { to_ns: 9, end_ns: 9, ..Default::default() });
+        // Nothing answers the step.
+        obey(&b"n\np\n"[..], &replay, runtime.handle());
+        let requests = [input.commands.blocking_recv(), input.commands.blocking_recv()];
+        let of = |command: &Option<Command>| match command {
+            Some(Command::Change(request, _)) => (request.step, request.paused),
+            other => panic!("{other:?}"),
+        };
+        let mut requests = requests.each_ref().map(of);
+        requests.sort();
+        assert_eq!(requests, [(None, Some(true)), (Some(1), None)]);
+    }
 
     #[test]
     fn a_line_asks_for_what_its_key_says() {

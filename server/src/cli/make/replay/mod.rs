@@ -28,7 +28,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::base::sync::locked;
 use crate::cli::make::serve::log_endpoints;
 use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print, print_line, stop_signal, usage_error};
+use crate::cli::shared::output::{block_on, print, print_line, stop_signal, usage_error};
 use crate::config::{Config, Vehicle};
 use crate::replay::ReplayHandle;
 use crate::replay::control::check;
@@ -134,7 +134,11 @@ async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Resul
     } else {
         print(&summary.to_text())?
     };
-    Ok(Exit::from_incomplete(!is_whole || !summary.reached_end))
+    let has_no_map = serve && summary.reached_end && summary.maps() == 0;
+    if has_no_map {
+        eprintln!("clearway: the whole drive made no map: {}", summary.why_no_map());
+    }
+    Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
 }
 
 /// How many bytes of the files a replay has read, for a progress bar.
@@ -192,7 +196,9 @@ pub async fn replay(
     let running_vehicles = running.vehicles.clone();
     let status = running_vehicles.0[0].status.clone();
     let mut summary = Summary {
+        vehicle: status.name.to_string(),
         snapshot: status.snapshot(),
+        others: Vec::new(),
         extrinsics,
         mount,
         truncated: Vec::new(),
@@ -249,11 +255,7 @@ pub async fn replay(
         summary.notes.push(format!("this machine was too slow for this speed: maps were up to {seconds:.1} s late"));
     }
     let others = running_vehicles.0.iter().skip(1);
-    summary
-        .notes
-        .extend(others.map(|served| {
-            format!("vehicle {}: {}", served.status.name, counted(served.status.snapshot().maps, "map"))
-        }));
+    summary.others = others.map(|served| (served.status.name.to_string(), served.status.snapshot())).collect();
     if let Some(clouds) = clouds {
         summary.clouds = std::mem::replace(&mut *locked(&clouds), Ok(0))?;
         if summary.clouds == 0 {
@@ -281,8 +283,9 @@ fn faults(options: &Options, extent: Option<(i64, i64)>, config: &Config) -> Res
         let text = std::fs::read_to_string(file);
         let text = text.map_err(|source| ReplayError::FaultScript { file: file.clone(), source })?;
         let lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim());
-        for line in lines.filter(|line| !line.is_empty()) {
-            all.push(line.parse()?);
+        for (number, line) in lines.enumerate().filter(|(_, line)| !line.is_empty()) {
+            let wrong = |source| ReplayError::FaultLine { file: file.clone(), line: number + 1, source };
+            all.push(line.parse().map_err(wrong)?);
         }
     }
     let names = |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.clone()).collect();
@@ -326,6 +329,11 @@ fn initial_state(options: &Options, extent: Option<(i64, i64)>) -> Result<v1::Re
     let range = v1::ReplayControl { from_ns: options.from.map(at), to_ns: options.to.map(at), ..Default::default() };
     if range.from_ns.is_some() || range.to_ns.is_some() {
         (state.from_ns, state.to_ns) = check(&range, &state, false)?;
+    }
+    if let Some(seconds) = options.seek {
+        let seek = v1::ReplayControl { seek_ns: Some(at(seconds)), ..Default::default() };
+        check(&seek, &state, false)?;
+        state.position_ns = at(seconds);
     }
     Ok(state)
 }

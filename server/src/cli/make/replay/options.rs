@@ -69,8 +69,9 @@ pub struct Options {
     /// Use the vehicle, the maps and the publishers of this configuration.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Override a key of the configuration, such as vehicle.maps.valid_ms=500; may be given several times.
-    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
+    /// Override a key of that configuration, or of the recorded one, such as vehicle.maps.valid_ms=500; may be given
+    /// several times.
+    #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
     /// Publish the maps, and the last one until SIGINT (Ctrl-C) or SIGTERM. Without --as-live the maps keep the stamps
     /// of the recording, so readers see those of an old recording as stale.
@@ -82,6 +83,9 @@ pub struct Options {
     /// Begin this many seconds after the first event; the maps from there are those of the whole drive.
     #[arg(long, value_name = "SECONDS", value_parser = offset)]
     pub from: Option<f64>,
+    /// Stand at this many seconds after the first event at the start, with the whole drive before and after it.
+    #[arg(skip)]
+    pub seek: Option<f64>,
     /// End this many seconds after the first event.
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub to: Option<f64>,
@@ -111,7 +115,9 @@ pub struct Options {
     #[arg(long, requires = "serve")]
     pub any_port: bool,
     /// Replay with a fault: lost:SENSOR@FROM-TO, loss:PERCENT or loss:PERCENT@FROM-TO, clock:MS@AT, pose:X,Y,YAW@AT or
-    /// stop@FROM-TO, in seconds after the first event, metres and degrees; may be given several times.
+    /// stop@FROM-TO, in seconds after the first event, metres and degrees; may be given several times. clock steps the
+    /// clock of this host, by which packets arrive: maps stamped by a sensor's own clock keep their stamps, and the
+    /// status names the difference.
     #[arg(long = "fault", value_name = "FAULT", value_parser = |text: &str| text.parse::<Fault>())]
     pub faults: Vec<Fault>,
     /// Replay with the faults of this file, one a line; # begins a comment.
@@ -252,6 +258,16 @@ pub enum ReplayError {
         /// The system's reason.
         source: std::io::Error,
     },
+    /// A line of the script is no fault.
+    #[error("--fault-script {}, line {line}: {source}", file.display())]
+    FaultLine {
+        /// The file.
+        file: PathBuf,
+        /// Number of the line, from 1 on.
+        line: usize,
+        /// What is wrong with it.
+        source: FaultError,
+    },
     /// Two recordings of one vehicle have different configurations of it.
     #[error("{}: its configuration of vehicle {vehicle} differs from that of the files before", file.display())]
     Differs {
@@ -259,6 +275,16 @@ pub enum ReplayError {
         file: PathBuf,
         /// The vehicle's name.
         vehicle: String,
+    },
+    /// The configuration's vehicle is none of the recording.
+    #[error("{}: its vehicle is {configured}, but the recording has {recorded}; the same name is allowed", file.display())]
+    OtherVehicle {
+        /// The configuration.
+        file: PathBuf,
+        /// Name of its vehicle.
+        configured: String,
+        /// Names of the recorded vehicles, separated by commas.
+        recorded: String,
     },
     /// The configuration does not fit the recording: its sensors are others, or in another order.
     #[error(

@@ -135,6 +135,7 @@ fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Res
             }
         }
     }
+    known.config = overridden(known.config, options, &options.files[0])?;
     let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
     let setup = known.setup(options)?;
     let boot_id = setup.boot_id;
@@ -160,6 +161,10 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
     if let Some(name) = options.vehicle.as_ref().filter(|_| options.config.is_none() && !journal) {
         let reason = "the files name no vehicle; the option needs --config FILE or a recording of clearway";
         return unused(format!("--vehicle {name}"), reason.into());
+    }
+    if let Some(set) = options.set.first().filter(|_| options.config.is_none() && !journal) {
+        let reason = "the files have no configuration; the option needs --config FILE or a recording of clearway";
+        return unused(format!("--set {set}"), reason.into());
     }
     let Some(record) = &options.record else { return Ok(()) };
     if let Some(from) = options.from {
@@ -301,7 +306,7 @@ impl Known {
         // The same files and settings get the same boot id. Served maps need a new one, because a reader that has seen
         // these maps before would drop them as old.
         let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
-        let same_maps = !altered && options.calibration.is_none();
+        let same_maps = !altered && options.calibration.is_none() && options.set.is_empty();
         let boot_id =
             boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
         let mut notes = BTreeMap::new();
@@ -366,11 +371,19 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
             let (mut config, mut tables) = recording.config()?;
             pick(file, &mut config, &mut tables)?;
             // The publishers and files of the recorded run are not those of this run.
-            let config = Config { vehicles: config.vehicles, ..Config::default() };
+            let config = overridden(Config { vehicles: config.vehicles, ..Config::default() }, options, file)?;
             return Ok(known(config, tables, Some(recording.header().boot_id), true));
         }
     }
     Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
+}
+
+/// A recorded configuration with the overrides of the options.
+fn overridden(config: Config, options: &Options, recording: &Path) -> Result<Config, ReplayError> {
+    match &options.set[..] {
+        [] => Ok(config),
+        set => Ok(Config::parse(&config.to_toml(), recording, set)?),
+    }
 }
 
 /// The topics of a ROS bag to read.

@@ -38,7 +38,7 @@ pub(super) fn several_vehicles(files: &Readings) -> Result<Option<Vec<Recorded>>
     Ok((names.len() > 1).then_some(recordings))
 }
 
-/// Refuses a configuration whose sensors are not those of the recording: events name a sensor by its place.
+/// Refuses a configuration whose vehicle or sensors are not those of the recording: events name a sensor by its place.
 pub(super) fn check_sensors(file: &Path, config: &Config, recording: &Path) -> Result<(), ReplayError> {
     let recording = RecordingReader::open(recording)?;
     if recording.header().config.is_none() {
@@ -48,9 +48,13 @@ pub(super) fn check_sensors(file: &Path, config: &Config, recording: &Path) -> R
     let vehicle = &config.vehicles[0];
     let names =
         |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");
-    let of_name = recorded.vehicles.iter().find(|of| of.name == vehicle.name || recorded.vehicles.len() == 1);
-    match of_name.map(|of| (names(vehicle), names(of))) {
-        Some((configured, recorded)) if configured != recorded => {
+    let Some(of_name) = recorded.vehicles.iter().find(|of| of.name == vehicle.name) else {
+        let names: Vec<&str> = recorded.vehicles.iter().map(|of| of.name.as_str()).collect();
+        let (configured, recorded) = (vehicle.name.clone(), names.join(", "));
+        return Err(ReplayError::OtherVehicle { file: file.to_owned(), configured, recorded });
+    };
+    match (names(vehicle), names(of_name)) {
+        (configured, recorded) if configured != recorded => {
             Err(ReplayError::Sensors { file: file.to_owned(), vehicle: vehicle.name.clone(), configured, recorded })
         }
         _ => Ok(()),

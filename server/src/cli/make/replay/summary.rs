@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::map::ElevationSource;
 use clearway_mapping::sensor::mount::{MountError, MountEstimate};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use crate::cli::shared::output::counted;
 use crate::ingest::files::Truncated;
@@ -34,8 +34,12 @@ pub enum Mount {
 /// The result of a replay.
 #[derive(Clone, Debug)]
 pub struct Summary {
-    /// Counters, sensors, maps and latency of the vehicle.
+    /// Name of the first vehicle.
+    pub vehicle: String,
+    /// Counters, sensors, maps and latency of the first vehicle.
     pub snapshot: Snapshot,
+    /// Name and state of every other vehicle.
+    pub others: Vec<(String, Snapshot)>,
     /// Extrinsics of the first sensor.
     pub extrinsics: Extrinsics,
     /// Where the extrinsics come from.
@@ -57,26 +61,10 @@ pub struct Summary {
 impl Summary {
     /// The summary as one JSON object.
     pub fn to_json(&self) -> Value {
-        let Snapshot { ledger, sensors, .. } = &self.snapshot;
-        let sensors = sensors.iter().map(|sensor| {
-            let model = sensor.status.model.map(clearway_lidar::model::Model::as_str);
-            json!({
-                "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
-                "revolutions": sensor.status.revolutions,
-                "elevations": sensor.elevations.map(ElevationSource::as_str),
-            })
-        });
+        let mut document = snapshot_json(&self.snapshot);
         let truncated = self.truncated.iter().map(|t| json!({ "file": t.file, "reason": t.reason }));
-        json!({
-            "packets": self.snapshot.packets_json(),
-            "telemetry": ledger.telemetry,
-            "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
-            "revolutions": self.snapshot.revolutions(),
-            "maps": self.snapshot.maps,
-            "sensors": sensors.collect::<Vec<_>>(),
-            "reference_sensor": self.snapshot.reference_sensor(),
-            "latency_ms": { "p50": self.snapshot.latency_ms_p50, "p99": self.snapshot.latency_ms_p99 },
-            "drivable_share": self.snapshot.drivable_share,
+        let of_run = json!({
+            "vehicle": self.vehicle,
             "mount": self.mount_json(),
             "truncated": truncated.collect::<Vec<_>>(),
             "notes": self.notes,
@@ -84,7 +72,37 @@ impl Summary {
             "record": self.record,
             "reached_end": self.reached_end,
             "seconds": self.seconds,
-        })
+        });
+        document.extend(of_run.as_object().cloned().unwrap_or_default());
+        let others = self.others.iter().map(|(name, snapshot)| {
+            let mut other = snapshot_json(snapshot);
+            other.insert("vehicle".to_owned(), name.as_str().into());
+            Value::Object(other)
+        });
+        document.insert("others".to_owned(), others.collect());
+        Value::Object(document)
+    }
+
+    /// Number of maps of all vehicles.
+    pub fn maps(&self) -> u64 {
+        self.snapshot.maps + self.others.iter().map(|(_, snapshot)| snapshot.maps).sum::<u64>()
+    }
+
+    /// Why no map was made, as far as the counts say it.
+    pub fn why_no_map(&self) -> String {
+        if let Mount::Unknown(why) = &self.mount {
+            return format!("the mount of the sensor is not known: {why}");
+        }
+        let ledger = &self.snapshot.ledger;
+        let refused = ledger.refused.iter().map(|(reason, n)| format!("{n} for {reason}")).collect::<Vec<_>>();
+        let refused = if refused.is_empty() { String::new() } else { format!(" ({})", refused.join(", ")) };
+        format!(
+            "of {} received {} were decoded and {}{refused} refused; they hold {}",
+            ledger.received,
+            ledger.decoded,
+            self.snapshot.refused(),
+            counted(self.snapshot.revolutions(), "revolution")
+        )
     }
 
     fn mount_json(&self) -> Value {
@@ -120,36 +138,15 @@ impl Summary {
 
     /// The summary as a few lines of text.
     pub fn to_text(&self) -> String {
-        let snapshot = &self.snapshot;
-        let ledger = &snapshot.ledger;
-        let mut lines = vec![format!(
-            "{} received, {} decoded, {} telemetry, {} refused, {} lost",
-            ledger.received,
-            ledger.decoded,
-            ledger.telemetry,
-            snapshot.refused(),
-            ledger.lost
-        )];
-        lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
-        let several = snapshot.sensors.len() > 1;
-        for sensor in &snapshot.sensors {
-            let model = sensor.status.model.map_or("unknown model", clearway_lidar::model::Model::as_str);
-            let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
-            let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
-            let (revolutions, returns) = (counted(revolutions, "revolution"), counted(returns, "return"));
-            lines.push(format!("{}: {model}{rpm}, {revolutions}, {returns}", sensor.name));
-            if several && sensor.is_reference {
-                lines.push("  reference sensor: its scans make the maps".to_owned());
+        let is_several = !self.others.is_empty();
+        let first = (&self.vehicle, &self.snapshot);
+        let all = std::iter::once(first).chain(self.others.iter().map(|(name, snapshot)| (name, snapshot)));
+        let mut lines = Vec::new();
+        for (name, snapshot) in all {
+            if is_several {
+                lines.push(format!("vehicle {name}"));
             }
-            if let Some((source, advice)) = sensor.elevations.and_then(|of| Some((of.as_str(), of.advice()?))) {
-                lines.push(format!("  elevations {source}: {advice}"));
-            }
-        }
-        let share =
-            snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
-        lines.push(format!("{}{share}", counted(snapshot.maps, "map")));
-        if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
-            lines.push(format!("time to make a map: median {p50:.2} ms, 99th percentile {p99:.2} ms"));
+            lines.extend(snapshot_lines(snapshot));
         }
         if let Some(record) = &self.record {
             lines.push(format!("recorded {}", record.display()));
@@ -162,6 +159,66 @@ impl Summary {
         }
         lines.join("\n") + "\n"
     }
+}
+
+/// The counts, sensors, maps and times of one vehicle, as lines.
+fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
+    let ledger = &snapshot.ledger;
+    let mut lines = vec![format!(
+        "{} received, {} decoded, {} telemetry, {} refused, {} lost",
+        ledger.received,
+        ledger.decoded,
+        ledger.telemetry,
+        snapshot.refused(),
+        ledger.lost
+    )];
+    lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
+    let several = snapshot.sensors.len() > 1;
+    for sensor in &snapshot.sensors {
+        let model = sensor.status.model.map_or("unknown model", clearway_lidar::model::Model::as_str);
+        let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
+        let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
+        let (revolutions, returns) = (counted(revolutions, "revolution"), counted(returns, "return"));
+        lines.push(format!("{}: {model}{rpm}, {revolutions}, {returns}", sensor.name));
+        if several && sensor.is_reference {
+            lines.push("  reference sensor: its scans make the maps".to_owned());
+        }
+        if let Some((source, advice)) = sensor.elevations.and_then(|of| Some((of.as_str(), of.advice()?))) {
+            lines.push(format!("  elevations {source}: {advice}"));
+        }
+    }
+    let share =
+        snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
+    lines.push(format!("{}{share}", counted(snapshot.maps, "map")));
+    if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
+        lines.push(format!("time to make a map: median {p50:.2} ms, 99th percentile {p99:.2} ms"));
+    }
+    lines
+}
+
+/// The counts, sensors, maps and times of one vehicle.
+fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
+    let Snapshot { ledger, sensors, .. } = snapshot;
+    let sensors = sensors.iter().map(|sensor| {
+        let model = sensor.status.model.map(clearway_lidar::model::Model::as_str);
+        json!({
+            "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
+            "revolutions": sensor.status.revolutions,
+            "elevations": sensor.elevations.map(ElevationSource::as_str),
+        })
+    });
+    let document = json!({
+        "packets": snapshot.packets_json(),
+        "telemetry": ledger.telemetry,
+        "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+        "revolutions": snapshot.revolutions(),
+        "maps": snapshot.maps,
+        "sensors": sensors.collect::<Vec<_>>(),
+        "reference_sensor": snapshot.reference_sensor(),
+        "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
+        "drivable_share": snapshot.drivable_share,
+    });
+    document.as_object().cloned().unwrap_or_default()
 }
 
 /// How the sensor is mounted and how that is known, in one line; `None` if it was given or is not needed.
