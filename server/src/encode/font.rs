@@ -5,9 +5,14 @@ pub const WIDTH: usize = 5;
 /// Height of a letter, in dots.
 pub const HEIGHT: usize = 7;
 
-/// The rows of a letter from the top, the leftmost dot in bit 4. Capital letters look like small ones. A character
-/// without dots of its own is a filled box.
+/// The rows of a letter from the top, the leftmost dot in bit 4. Capital letters look like small ones, but for T and Z,
+/// which stamps have. A character without dots of its own is a filled box.
 pub fn rows(letter: char) -> [u8; HEIGHT] {
+    match letter {
+        'T' => return [0b11111, 0b00100, 0b00100, 0b00100, 0b00100, 0b00100, 0b00100],
+        'Z' => return [0b11111, 0b00001, 0b00010, 0b00100, 0b01000, 0b10000, 0b11111],
+        _ => {}
+    }
     match letter.to_ascii_lowercase() {
         ' ' => [0; HEIGHT],
         'a' => [0, 0, 0b01110, 0b00001, 0b01111, 0b10001, 0b01111],

@@ -28,7 +28,8 @@ const BAR_WIDTH_MIN: usize = 32;
 pub enum Legend {
     /// Name and colour of each class; none for ids, of which only equality means something.
     Classes(Vec<(String, Rgb)>),
-    /// The least and the greatest value of a channel, as texts, for the colours from dark to light.
+    /// The name and the least value of a channel, and its greatest value and unit, as texts, for the colours from dark
+    /// to light.
     Scale([String; 2]),
 }
 
@@ -217,7 +218,7 @@ mod tests {
 
     #[test]
     fn a_channel_has_a_bar_from_its_least_to_its_greatest_colour() {
-        let legend = Legend::Scale(["-12.75".into(), "1023.5 m/s".into()]);
+        let legend = Legend::Scale(["roughness -12.75".into(), "1023.5 m/s".into()]);
         for width in [16, 120, 800] {
             let strip = strip(&[], &legend, width, 0.1);
             let dot = (width / PIXELS_PER_DOT).max(1);
@@ -244,7 +245,7 @@ mod tests {
 
     #[test]
     fn every_letter_of_a_name_has_dots_of_its_own() {
-        let letters: Vec<char> = ('a'..='z').chain('0'..='9').chain("_-.:/%^".chars()).collect();
+        let letters: Vec<char> = ('a'..='z').chain('0'..='9').chain("_-.:/%^TZ".chars()).collect();
         for (index, letter) in letters.iter().enumerate() {
             let rows = font::rows(*letter);
             assert!(rows != [0b11111; font::HEIGHT] && rows != [0; font::HEIGHT], "{letter}");

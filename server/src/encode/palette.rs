@@ -3,9 +3,9 @@
 /// A colour: red, green, blue.
 pub type Rgb = [u8; 3];
 
-/// Colours from the least to the greatest value: dark blue to light yellow, even in lightness, for colour-blind eyes
-/// and in grey.
-const STOPS: [Rgb; 5] = [[20, 44, 110], [70, 90, 120], [120, 128, 120], [186, 172, 98], [254, 232, 90]];
+/// Colours from the least to the greatest value: blue, lighter than unknown cells, to light yellow, even in lightness,
+/// for colour-blind eyes and in grey.
+const STOPS: [Rgb; 5] = [[48, 88, 184], [100, 120, 150], [150, 154, 140], [206, 192, 112], [254, 232, 90]];
 /// Hues of consecutive ids are this far apart, in degrees: the golden angle.
 const HUE_STEP_DEG: f64 = 137.508;
 
@@ -44,7 +44,7 @@ mod tests {
         for (index, stop) in STOPS.iter().enumerate() {
             assert_eq!(scale_colour(index as f64 / 4.0), *stop);
         }
-        assert_eq!(scale_colour(0.125), [45, 67, 115]);
+        assert_eq!(scale_colour(0.125), [74, 104, 167]);
     }
 
     #[test]

@@ -49,6 +49,8 @@ pub struct Style {
     pub vehicle: bool,
     /// Name of the channel; `None` shows the classes, or the first channel of a layer without classes.
     pub channel: Option<String>,
+    /// Values of the first and the last colour of the channel; `None`: the least and the greatest of the layer.
+    pub values: Option<[f64; 2]>,
     /// True if the strip with the legend is under the map.
     pub legend: bool,
     /// Lines of text over the legend, such as the stamp of the map; they need the strip.
@@ -66,6 +68,7 @@ impl Default for Style {
             rings_m: None,
             vehicle: true,
             channel: None,
+            values: None,
             legend: true,
             caption: Vec::new(),
             stale: false,
@@ -86,11 +89,22 @@ pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, PictureError> {
 /// # Errors
 /// [`PictureError::NoChannel`] if the style names a channel that the layer does not have.
 pub fn of_layer(layer: &Layer, style: &Style) -> Result<Picture, PictureError> {
-    let colours = Colours::of(layer, style.channel.as_deref())?;
+    let colours = Colours::of(layer, style.channel.as_deref(), style.values)?;
     let range_m = style.range_m.unwrap_or(layer.grid.range_m_max());
     let colour_at = |x_m, y_m| layer.grid.cell_at(x_m, y_m).map_or(UNKNOWN, |cell| colours.of_cell(layer, cell));
     let picture = draw(range_m, style, &layer.points, &colours.legend(layer), colour_at);
     Ok(Picture { comment: colours.text(layer), ..picture })
+}
+
+/// The least and the greatest value of a channel of a layer; `None` if no cell has one, and for classes and ids.
+///
+/// # Errors
+/// [`PictureError::NoChannel`] if the layer does not have it.
+pub fn values(layer: &Layer, channel: &str) -> Result<Option<[f64; 2]>, PictureError> {
+    Ok(match Colours::of(layer, Some(channel), None)? {
+        Colours::Values(_, least, greatest) if least <= greatest => Some([least, greatest]),
+        _ => None,
+    })
 }
 
 /// The lines under a picture of a map: vehicle, layer, sequence and stamp; then the sensors that are not whole, with

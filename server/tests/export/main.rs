@@ -90,6 +90,12 @@ fn several_layers_or_all_are_exported_with_their_names() {
     assert_eq!(export("two", &["--layer", "second,drivability"]).1, both);
     assert_eq!(export("again", &["--layer", "second", "--layer", "drivability"]).1, both);
     assert_eq!(export("one", &["--layer", "second"]).1.len(), 3);
+    let (refused, _) = export("channel", &["--channel", "nothing"]);
+    assert!(text(&refused.stderr).contains("no layer has the channel \"nothing\""), "{}", text(&refused.stderr));
+    assert!(!folder.path().join("channel").exists(), "no folder is left");
+    let sheet = ["export", file.to_str().unwrap(), "--layer", "second", "--format", "sheet", "--pixels", "64", "--out"];
+    let done = clearway(&[&sheet[..], &[folder.path().join("sheet").to_str().unwrap()]].concat());
+    assert!(text(&done.stdout).contains("3 of 3 maps of second in"), "{}", text(&done.stdout));
     let (refused, _) = export("none", &["--layer", "second,third"]);
     assert_eq!(refused.status.code(), Some(2));
     assert!(

@@ -95,19 +95,35 @@ fn a_picture_has_links_and_radii_of_safe_points_over_the_classes() {
 fn a_picture_of_a_channel_is_a_heat_map_with_its_scale() {
     let heights = picture("drivability", 240, &["--channel", "unit_height"]);
     assert_eq!(heights.texts["Comment"], "unit_height: dark 0.0 m to light 5.5 m");
-    assert_eq!(heights.at(6.1, 6.1), [20, 44, 110], "the least height, ahead and to the left");
+    assert_eq!(heights.at(6.1, 6.1), [48, 88, 184], "the least height, ahead and to the left");
     // Height 3.5 m of 5.5 m.
-    assert_eq!(heights.at(10.1, -10.1), [156, 152, 108], "14 m off, ahead and to the right");
-    assert_eq!(heights.at(-10.1, -10.1), [132, 136, 116], "3 m: 14 m off, behind and to the right");
+    assert_eq!(heights.at(10.1, -10.1), [181, 175, 125], "14 m off, ahead and to the right");
+    assert_eq!(heights.at(-10.1, -10.1), [160, 161, 135], "3 m: 14 m off, behind and to the right");
     assert_eq!(heights.at(-3.1, -3.1), [58, 63, 70], "an unknown cell");
     // The bar of the colours is in the strip under the map, in place of the classes.
     let position = |colour| heights.strip().iter().position(|&pixel| pixel == colour).map(|index| index % 240);
-    let (least, greatest) = (position([20, 44, 110]).unwrap(), position([254, 232, 90]).unwrap());
-    assert!(least < 60 && greatest > 120, "{least}, {greatest}");
+    let (least, greatest) = (position([48, 88, 184]).unwrap(), position([254, 232, 90]).unwrap());
+    assert!(
+        least < 120 && greatest > 180,
+        "between the name with the least value and the greatest: {least}, {greatest}"
+    );
     assert_eq!(COLOURS[1..].iter().find(|&&colour| position(colour).is_some()), None);
     let ids = picture("drivability", 240, &["--channel", "segment"]);
     assert_eq!(ids.texts["Comment"], "segment: one colour for each id");
     assert_eq!(ids.at(6.1, 6.1), ids.at(-20.1, 20.1), "one segment has one colour");
+}
+
+#[test]
+fn the_colours_of_a_channel_have_the_same_values_in_all_pictures_of_a_layer() {
+    let town = concat!(env!("CARGO_MANIFEST_DIR"), "/../client/golden/town.mcap");
+    let folder = folder();
+    let out = folder.path().join("png");
+    let arguments = ["export", town, "--channel", "roughness", "--format", "png", "--pixels", "64", "--out"];
+    let done = clearway(&[&arguments[..], &[out.to_str().unwrap()]].concat());
+    assert!(done.status.success(), "{}", text(&done.stderr));
+    let files = std::fs::read_dir(&out).unwrap().map(|entry| entry.unwrap().path());
+    let comments: Vec<String> = files.map(|file| decoded(&file).3["Comment"].clone()).collect();
+    assert!(comments.len() > 5 && comments.iter().all(|comment| *comment == comments[0]), "{comments:?}");
 }
 
 #[test]

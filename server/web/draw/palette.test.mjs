@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import test from "node:test";
-import { css, idColour, scaleColour, scaleGradient, word } from "./palette.js";
+import { css, idColour, scaleColour, scaleGradient, UNKNOWN, word } from "./palette.js";
 
 // Relative luminance (WCAG 2.1, without its gamma curve, which keeps the order).
 const luminance = ([red, green, blue]) => 0.2126 * red + 0.7152 * green + 0.0722 * blue;
@@ -10,7 +10,8 @@ const luminance = ([red, green, blue]) => 0.2126 * red + 0.7152 * green + 0.0722
 test("the colours of a scale get lighter from its least value to its greatest", () => {
   const lights = Array.from({ length: 101 }, (_, i) => luminance(scaleColour(i / 100)));
   for (let i = 1; i < lights.length; i++) assert.ok(lights[i] >= lights[i - 1], `at ${i} %`);
-  assert.ok(lights[100] - lights[0] > 150, `${lights[0]} to ${lights[100]}`);
+  assert.ok(lights[100] - lights[0] > 130, `${lights[0]} to ${lights[100]}`);
+  assert.ok(lights[0] - luminance(UNKNOWN) > 20, "the least value is told from an unknown cell");
   assert.deepEqual([scaleColour(-1), scaleColour(2)], [scaleColour(0), scaleColour(1)]);
 });
 

@@ -16,7 +16,7 @@ pub(crate) enum Colours {
     Classes(usize, Vec<Rgb>),
     /// Index of a channel of ids.
     Ids(usize),
-    /// Index of another channel, and its least and greatest known value.
+    /// Index of another channel, and the values of its first and last colour.
     Values(usize, f64, f64),
     /// No channel.
     None,
@@ -28,13 +28,15 @@ fn is_id(channel: &Channel) -> bool {
 }
 
 impl Colours {
-    /// The colours of a channel; of the classes, or of the first channel of a layer without classes, if none is named.
-    pub(crate) fn of(layer: &Layer, channel: Option<&str>) -> Result<Self, PictureError> {
+    /// The colours of a channel from the first to the second of these values, or over those of the layer if none are
+    /// given; of the classes, or of the first channel of a layer without classes, if no channel is named.
+    pub(crate) fn of(layer: &Layer, channel: Option<&str>, values: Option<[f64; 2]>) -> Result<Self, PictureError> {
         let find = |name: &str| layer.channels.iter().position(|channel| channel.name == name);
         let Some(name) = channel else { return Ok(Self::of_layer(layer)) };
-        match find(name) {
-            Some(index) => Ok(Self::of_channel(layer, index)),
-            None => Err(PictureError::NoChannel {
+        match (find(name).map(|index| Self::of_channel(layer, index)), values) {
+            (Some(Self::Values(index, ..)), Some([least, greatest])) => Ok(Self::Values(index, least, greatest)),
+            (Some(colours), _) => Ok(colours),
+            (None, _) => Err(PictureError::NoChannel {
                 layer: layer.name.clone(),
                 channel: name.to_owned(),
                 present: layer.channels.iter().map(|channel| &*channel.name).collect::<Vec<_>>().join(", "),
@@ -82,14 +84,18 @@ impl Colours {
         colour.unwrap_or(UNKNOWN)
     }
 
-    /// The texts of the least and of the greatest known value, and the unit; `None` for classes and ids, and if no cell
-    /// is known.
+    /// The texts of the values of the first and the last colour, and the unit; `None` for classes and ids, and if no
+    /// cell is known.
     pub(crate) fn scale<'a>(&self, layer: &'a Layer) -> Option<([String; 2], &'a str)> {
-        let &Self::Values(channel, least, greatest) = self else { return None };
-        let channel = &layer.channels[channel];
+        let (channel, &Self::Values(_, least, greatest)) = (self.channel(layer)?, self) else { return None };
         // 0.01 in single precision is a little less than 0.01.
         let digits = (-f64::from(channel.scale).log10() - 1e-6).ceil().clamp(0.0, 6.0) as usize;
         (least <= greatest).then(|| ([least, greatest].map(|value| format!("{value:.digits$}")), &*channel.unit))
+    }
+
+    /// The channel, if it is one of values.
+    fn channel<'a>(&self, layer: &'a Layer) -> Option<&'a Channel> {
+        if let &Self::Values(channel, ..) = self { layer.channels.get(channel) } else { None }
     }
 
     /// What the colours mean, for the strip under the picture.
@@ -99,7 +105,8 @@ impl Colours {
                 layer.legend.iter().map(|class| class.name.clone()).zip(colours.iter().copied()).collect(),
             ),
             (_, Some(([least, greatest], unit))) => {
-                Legend::Scale([least, format!("{greatest} {unit}").trim_end().to_owned()])
+                let name = self.channel(layer).map_or("", |channel| &*channel.name);
+                Legend::Scale([format!("{name} {least}"), format!("{greatest} {unit}").trim_end().to_owned()])
             }
             (_, None) => Legend::Classes(Vec::new()),
         }

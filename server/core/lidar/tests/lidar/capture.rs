@@ -74,7 +74,10 @@ pub fn pcapng(frames: &[Vec<u8>], if_tsresol: u8, ticks: u64) -> Vec<u8> {
 fn read(bytes: &[u8]) -> (Vec<Datagram>, Option<CaptureError>, Skipped) {
     let mut capture = Capture::new(bytes).unwrap();
     let (mut datagrams, mut error) = (Vec::new(), None);
-    for item in capture.by_ref() {
+    let mut offset = capture.offset();
+    while let Some(item) = capture.next() {
+        assert!(offset <= capture.offset() && capture.offset() <= bytes.len() as u64, "it rises within the file");
+        offset = capture.offset();
         match item {
             Ok(datagram) => datagrams.push(datagram),
             Err(found) => error = Some(found),
@@ -100,6 +103,8 @@ fn every_kind_of_capture_gives_the_same_datagrams() {
                 let bytes = pcap(link, &vec![frame; 300], big_endian, nanoseconds);
                 let (datagrams, error, skipped) = read(&bytes);
                 assert_eq!((datagrams.len(), error, skipped), (300, None, Skipped::default()), "link {link}");
+                let mut capture = Capture::new(&bytes[..]).unwrap();
+                assert_eq!((capture.by_ref().count(), capture.offset()), (300, bytes.len() as u64));
                 assert_eq!(datagrams[299].stamp_ns, 100_299_000_000);
                 assert_eq!(datagrams[299].source, "192.168.1.201:443".parse().unwrap());
                 assert_eq!((datagrams[0].destination_port, datagrams[0].payload.len()), (2368, 1206));

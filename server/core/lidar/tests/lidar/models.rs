@@ -229,7 +229,7 @@ fn a_calibration_of_another_model_refuses_the_first_packet() {
 fn lasers_fire_at_the_times_and_azimuths_of_the_manuals() {
     for (model, laser, offset_ns) in [
         (Model::Hdl64eS1, 63, 0),
-        (Model::Hdl64eS2, 5, 7_260),
+        (Model::Hdl64eS2, 9, 13_260),
         (Model::Hdl64eS3, 39, 9_700),
         (Model::Vlp32c, 3, 2_304),
         (Model::Vls128, 63, 18_655),

@@ -31,6 +31,9 @@ fn a_fix_is_read_to_the_last_field() {
     assert!((fix.longitude_deg.unwrap() + 121.654_483_333).abs() < 1e-9);
     assert_eq!((fix.speed_knots, fix.course_deg), (Some(10.3), Some(188.2)));
     assert!((fix.speed_mps().unwrap() - 5.298_78).abs() < 1e-4);
+    let with_fraction = with_sum(&SENTENCE[1..SENTENCE.len() - 5].replace("214106", "214106.25"));
+    let fix = Telemetry::new(&datagram(0, &with_fraction)).unwrap().gprmc.unwrap();
+    assert_eq!(fix.utc_ns, Some(1_437_687_666_250_000_000));
 }
 
 #[test]

@@ -17,7 +17,8 @@ pub struct DrawingOptions {
     /// Draw a ring at each multiple of this distance from the vehicle.
     #[arg(long, value_name = "METRES", value_parser = metres)]
     rings: Option<f64>,
-    /// Draw this channel, such as roughness, with its colour bar; the classes if absent.
+    /// Draw this channel, such as roughness, of the layers that have it; the classes if absent. The colours have the
+    /// same values in all pictures of a layer.
     #[arg(long)]
     channel: Option<String>,
     /// Leave out the vehicle.
@@ -38,6 +39,7 @@ impl DrawingOptions {
             rings_m: rings,
             vehicle: !no_vehicle,
             channel: channel.clone(),
+            values: None,
             legend: !plain,
             caption: Vec::new(),
             stale: false,

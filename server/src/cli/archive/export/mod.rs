@@ -167,9 +167,10 @@ pub fn run(options: &Options) -> Result<Exit> {
     let Options { recording: file, layers, out, vehicle, .. } = options;
     let (_, length) = files::open(file)?;
     check_layers(options)?;
+    let style = options.drawing.style();
+    let values = channel_values(options, &style)?;
     let mut recording = McapReader::open(file)?;
     let mut output = Output::new(options)?;
-    let style = options.drawing.style();
     let progress = progress_bar(length);
     // Number of maps, by layer.
     let mut maps: BTreeMap<String, u64> = BTreeMap::new();
@@ -188,6 +189,13 @@ pub fn run(options: &Options) -> Result<Exit> {
         if !layers.is_empty() && !layers.iter().any(|name| name == layer) {
             continue;
         }
+        let style = match &values {
+            Some(of_layers) => match of_layers.get(layer) {
+                Some(values) => Style { values: *values, ..style.clone() },
+                None => continue,
+            },
+            None => style.clone(),
+        };
         if !vehicles.iter().any(|known| known == of_vehicle) {
             vehicles.push(of_vehicle.to_owned());
         }
@@ -199,12 +207,12 @@ pub fn run(options: &Options) -> Result<Exit> {
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
             }
             Output::Sheets(sheets) => {
-                let style = Style { caption: picture::caption(map.header(), layer), ..style.clone() };
+                let style = Style { caption: picture::caption(map.header(), layer), ..style };
                 let sheet = sheets.entry(layer.to_owned()).or_default();
                 sheet.push(|| picture::of_layer(of_layer, &style))?;
             }
             Output::Gifs(gifs) => {
-                let style = Style { caption: picture::caption(map.header(), layer), ..style.clone() };
+                let style = Style { caption: picture::caption(map.header(), layer), ..style };
                 let drawn = picture::of_layer(of_layer, &style)?;
                 if !gifs.contains_key(layer) {
                     files::create_folder(out)?;
@@ -214,16 +222,19 @@ pub fn run(options: &Options) -> Result<Exit> {
                 gifs.get_mut(layer).into_iter().try_for_each(|gif| gif.push(&drawn, map.header().capture_end_ns))?;
             }
             Output::Files(encode) => {
+                let encoded = encode(&map, of_layer, &style)?;
                 if maps.is_empty() {
                     files::create_folder(out)?;
                 }
-                write(&format!("{:06}_{layer}", map.sequence()), encode(&map, of_layer, &style)?, out)?;
+                write(&format!("{:06}_{layer}", map.sequence()), encoded, out)?;
             }
         }
         *maps.entry(layer.to_owned()).or_default() += 1;
         progress.set_message(counted(maps.values().sum(), "map"));
     }
     progress.finish_and_clear();
+    // Number of maps on each sheet.
+    let mut shown: BTreeMap<String, usize> = BTreeMap::new();
     match output {
         Output::Files(_) => {}
         Output::Gifs(gifs) => gifs.into_values().try_for_each(Gif::finish)?,
@@ -231,6 +242,7 @@ pub fn run(options: &Options) -> Result<Exit> {
         Output::Sheets(sheets) => {
             files::create_folder(out)?;
             for (layer, sheet) in sheets {
+                shown.insert(layer.clone(), sheet.shown());
                 write(&format!("sheet_{layer}"), vec![(ending(&style, "png"), sheet.finish().to_png()?)], out)?;
             }
         }
@@ -243,9 +255,42 @@ pub fn run(options: &Options) -> Result<Exit> {
         bail!("{}", nothing_exported(file, &recording, None, vehicle.as_deref()));
     }
     for (layer, maps) in &maps {
-        print_line(&format!("{} of {layer} in {}", counted(*maps, "map"), out.display()))?;
+        let shown = shown.get(layer).map_or(String::new(), |shown| format!("{shown} of "));
+        print_line(&format!("{shown}{} of {layer} in {}", counted(*maps, "map"), out.display()))?;
     }
     Ok(Exit::from_incomplete(incomplete.is_some()))
+}
+
+/// The least and the greatest value of the channel that is drawn in all maps, by layer that has it; `None` if classes
+/// are drawn.
+fn channel_values(options: &Options, style: &Style) -> Result<Option<BTreeMap<String, Option<[f64; 2]>>>> {
+    let Some(channel) = &style.channel else { return Ok(None) };
+    let Options { recording: file, layers, vehicle, .. } = options;
+    let mut found: BTreeMap<String, Option<[f64; 2]>> = BTreeMap::new();
+    let mut refused = None;
+    for message in McapReader::open(file)? {
+        let message = message?;
+        let Some((_, layer)) = message.map_of() else { continue };
+        let is_of_vehicle = vehicle.as_ref().is_none_or(|only| message.vehicle() == Some(only));
+        if !is_of_vehicle || !layers.is_empty() && !layers.iter().any(|name| name == layer) {
+            continue;
+        }
+        match picture::values(decode(&message, file)?.layer(layer)?, channel) {
+            Ok(values) => {
+                let known = found.entry(layer.to_owned()).or_default();
+                *known = match (*known, values) {
+                    (Some(a), Some(b)) => Some([a[0].min(b[0]), a[1].max(b[1])]),
+                    (a, b) => a.or(b),
+                };
+            }
+            Err(error) if layers.is_empty() => refused = Some(error),
+            Err(error) => return Err(error.into()),
+        }
+    }
+    match refused {
+        Some(error) if found.is_empty() => Err(error).context(format!("no layer has the channel {channel:?}")),
+        _ => Ok(Some(found)),
+    }
 }
 
 fn decode(message: &Message, file: &Path) -> Result<MapView> {

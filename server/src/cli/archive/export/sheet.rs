@@ -42,6 +42,11 @@ impl Sheet {
         Ok(())
     }
 
+    /// Number of maps on the sheet.
+    pub fn shown(&self) -> usize {
+        self.pictures.len()
+    }
+
     /// The sheet.
     pub fn finish(self) -> Picture {
         Picture::sheet(&self.pictures, COLUMNS)
