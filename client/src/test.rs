@@ -3,11 +3,11 @@
 //! The command `clearway` is the one that the environment variable `CLEARWAY` names, else the one that cargo built
 //! beside the test, else the installed one. The stamps of the maps are shifted to the present, so that their ages are
 //! as on the vehicle. The drive begins when the first reader has subscribed; after its end the last map stays, and
-//! becomes stale.
+//! becomes stale. [`Client::replay_control`] pauses, steps and seeks.
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
@@ -17,6 +17,9 @@ use crate::{Client, ClientError};
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Interval at which the ready file is looked for.
 const POLL: Duration = Duration::from_millis(5);
+
+/// The file of what the server says.
+const LOG: &str = "log.txt";
 
 /// A recording that is replayed by a server of its own process, on free ports of this machine. Dropping it ends the
 /// server.
@@ -49,6 +52,9 @@ pub enum ReplayError {
     /// The server was not ready in time.
     #[error("clearway replay is not ready after {} s", PATIENCE.as_secs())]
     Late,
+    /// The server has not ended in time.
+    #[error("clearway replay has not ended after {} s; --exit-at-end ends it with the drive", PATIENCE.as_secs())]
+    Running,
     /// A folder or file of the replay cannot be written or read.
     #[error("{}: {source}", path.display())]
     File {
@@ -93,7 +99,7 @@ impl Replay {
         static STARTED: AtomicU32 = AtomicU32::new(0);
         let number = STARTED.fetch_add(1, Ordering::Relaxed);
         let folder = std::env::temp_dir().join(format!("clearway-replay-{}-{number}", std::process::id()));
-        let [ready, log] = ["ready.json", "log.txt"].map(|name| folder.join(name));
+        let [ready, log] = ["ready.json", LOG].map(|name| folder.join(name));
         let file = |path: &Path| {
             let path = path.to_owned();
             move |source| ReplayError::File { path, source }
@@ -139,6 +145,27 @@ impl Replay {
     /// As [`Client::connect`].
     pub async fn client(&self) -> Result<Client, ClientError> {
         Client::connect(&self.grpc).await
+    }
+
+    /// Waits until the server has ended, which it does with the option `--exit-at-end`; returns its exit status.
+    ///
+    /// # Errors
+    /// [`ReplayError::Running`] if it has not ended after 60 s, [`ReplayError::File`] if the system does not tell.
+    pub fn wait(&mut self) -> Result<ExitStatus, ReplayError> {
+        let began = Instant::now();
+        while began.elapsed() < PATIENCE {
+            let ended = self.server.try_wait();
+            if let Some(status) = ended.map_err(|source| ReplayError::File { path: self.folder.clone(), source })? {
+                return Ok(status);
+            }
+            std::thread::sleep(POLL);
+        }
+        Err(ReplayError::Running)
+    }
+
+    /// What the server has said so far.
+    pub fn log(&self) -> String {
+        fs::read_to_string(self.folder.join(LOG)).unwrap_or_default()
     }
 
     /// Stops the server as a crash would: without a word to its readers.

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 
 use clearway_client::test::{Replay, town};
-use clearway_client::{Footprint, StreamEvent, Subscription, now_ns};
+use clearway_client::{Footprint, StreamEvent, Subscription, now_ns, v1};
 use clearway_tests::{binaries, run, workspace};
 
 #[tokio::test]
@@ -28,6 +28,25 @@ async fn the_street_ahead_is_free() -> Result<(), Box<dyn std::error::Error>> {
     while maps.next().await.is_ok() {} // to the end of the drive
     while !matches!(maps.next_or_stale().await?, StreamEvent::Stale(_)) {}
     Ok(())
+}
+
+#[tokio::test]
+async fn a_replay_is_paused_and_stepped_and_its_exit_status_and_log_are_known() {
+    binaries();
+    let mut drive = Replay::with(town(), &["--paused", "--exit-at-end"]).unwrap();
+    let client = drive.client().await.unwrap();
+    let mut maps = client.subscribe(Subscription::default()).await.unwrap();
+    let control = |step, paused| v1::ReplayControl { step, paused, ..Default::default() };
+    let state = client.replay_control(control(Some(2), None)).await.unwrap();
+    assert_eq!((state.phase(), &state.maps[..]), (v1::ReplayPhase::Paused, &[2][..]), "{state:?}");
+    client.replay_control(control(None, Some(false))).await.unwrap();
+    let mut read = 0;
+    while maps.next().await.is_ok() {
+        read += 1;
+    }
+    let status = drive.wait().unwrap();
+    assert!(read > 2 && status.success(), "{read} maps, {status}: {}", drive.log());
+    assert!(drive.log().contains("INFO"), "{}", drive.log());
 }
 
 /// The code blocks of the README's section, by language.

@@ -68,8 +68,8 @@ pub fn a_drive_is_shown_in_3d() {
     assert_eq!(phone.console_errors(), Vec::<String>::new(), "the console of the phone has no errors");
 }
 
-/// Chooses the view in 3-D. A busy machine refuses WebGL at times; then the page shows the flat map and says so, and the
-/// button is pressed again, as a user would.
+/// Chooses the view in 3-D. A busy machine refuses WebGL at times; then the page shows the flat map and says so, and
+/// the button is pressed again, as a user would.
 fn open(browser: &Browser) {
     let script = "const button = document.getElementById('space-button');
         if (button.getAttribute('aria-pressed') === 'false') button.click();
