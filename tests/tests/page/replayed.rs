@@ -43,7 +43,7 @@ async fn stop_at(client: &Client, seconds: f64) -> MapView {
 
 /// Waits until the page shows this map.
 fn await_map(browser: &Browser, sequence: u64) {
-    let shown = "document.querySelector('#stream dd').textContent";
+    let shown = "document.querySelector('#stream dd')?.textContent";
     browser.until("the map", &format!("return {shown} === '{sequence}'"));
 }
 
@@ -102,7 +102,7 @@ pub fn the_time_bar_controls_a_replay() {
         browser.until(
             "the map of that moment",
             "return document.querySelector('[data-part=time]').textContent.startsWith('0.8 ') &&
-                Number(document.querySelector('#stream dd').textContent) >= 7",
+                Number(document.querySelector('#stream dd')?.textContent) >= 7",
         );
         browser.run(
             "const rate = document.querySelector('[data-part=rate]');
@@ -140,7 +140,7 @@ pub fn a_viewed_drive_steps() {
     browser.open(page.trim());
     browser.until("the time bar", "return !document.getElementById('replay').hidden");
     browser.until("a pause", "return document.querySelector('[data-part=play]').textContent === 'Play'");
-    browser.until("a map", "return /^\\d+$/.test(document.querySelector('#stream dd').textContent)");
+    browser.until("a map", "return /^\\d+$/.test(document.querySelector('#stream dd')?.textContent)");
     let first: u64 = browser.text("#stream dd").parse().expect("a sequence");
     browser.click("[data-part=step]");
     await_map(&browser, first + 1);
