@@ -13,6 +13,9 @@ use crate::error::ClientError;
 use crate::freshness::{Clock, POLL_INTERVAL};
 use crate::view::MapView;
 
+/// Longest wait for a map after the end of a replay was told. Ours: a seek takes less, and a test does not hang.
+const AFTER_END: Duration = Duration::from_secs(2);
+
 /// One map from a stream.
 #[derive(Clone, Debug)]
 pub struct Update {
@@ -61,6 +64,8 @@ struct Slot {
     /// How often a replay has reached its end, and how the reader is told.
     replay_ends: u64,
     replay_ended: Option<ClientError>,
+    /// No map has come since the replay ended.
+    is_at_end: bool,
 }
 
 /// Numbers of received maps that a stream passed over since its start, by reason. None of them was shown to the reader.
@@ -157,12 +162,13 @@ impl MapStream {
     /// # Errors
     /// Why the stream has ended, after its last map was returned; subscribe again then. [`ClientError::Ended`] if the
     /// server ended it, [`ClientError::Unreachable`] if the connection failed, [`ClientError::Refused`] if the server
-    /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] once after the last
-    /// map of a replay; the stream has not ended then.
+    /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] after the last map of
+    /// a replay; the stream has not ended then. The next call waits 2 s for a map of a replay that is set back, and then
+    /// says so again.
     pub async fn next(&mut self) -> Result<Update, ClientError> {
         self.handled.send_replace(self.seen.map_or(0, |seen| seen.maps));
         loop {
-            {
+            let told = {
                 let slot = self.slot.borrow_and_update();
                 let counters = slot.counters;
                 if let Some(map) = slot.newest.as_ref().filter(|_| self.seen != Some(counters)) {
@@ -180,8 +186,13 @@ impl MapStream {
                 if let Some(reason) = &slot.ended {
                     return Err(reason.clone());
                 }
-            }
-            if self.slot.changed().await.is_err() {
+                slot.replay_ended.clone().filter(|_| slot.is_at_end)
+            };
+            let changed = match told {
+                None => self.slot.changed().await,
+                Some(ended) => tokio::time::timeout(AFTER_END, self.slot.changed()).await.map_err(|_| ended)?,
+            };
+            if changed.is_err() {
                 return Err(ClientError::Ended { address: "the background task".into() });
             }
         }
@@ -272,6 +283,7 @@ impl LatestSlot {
         self.slot.send_modify(|slot| {
             slot.replay_ends += 1;
             slot.replay_ended = Some(ended);
+            slot.is_at_end = true;
         });
     }
 
@@ -292,6 +304,7 @@ impl LatestSlot {
             counters.lost = counters.lost.saturating_add(missed.lost);
             counters.left_out = counters.left_out.saturating_add(missed.left_out);
             slot.newest = Some(map);
+            slot.is_at_end = false;
             true
         });
     }

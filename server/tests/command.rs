@@ -127,6 +127,9 @@ fn a_negative_number_is_a_wrong_value_and_not_an_unknown_option() {
         (&["simulate", "flat", "--out", "a.pcap", "--seconds", "-1"], "0.1 to 3600 seconds are allowed"),
         (&["demo", "--seconds", "-1"], "0 or more seconds are allowed"),
         (&["ingest", "a.bin", "--hz", "-1"], "0.1 to 100 is allowed"),
+        (&["transport", "seek", "inf"], "0 or more seconds are allowed"),
+        (&["transport", "step", "0"], "0 is not in 1..=1000000"),
+        (&["transport", "range", "5", "2"], "range 5 2: the range must end after it begins"),
         (&["get", "--range", "-1"], "0.1 to 10000 m is allowed"),
     ] {
         let output = clearway(arguments);

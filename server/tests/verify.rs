@@ -178,6 +178,22 @@ fn recordings_without_a_map_in_common_are_not_compared() {
 }
 
 #[test]
+fn maps_that_a_cut_recording_lacks_are_no_change() {
+    let folder = tempfile::tempdir().unwrap();
+    let shorter = folder.path().join("shorter.mcap");
+    let is_early = |topic: &str, sequence| !topic.starts_with("/car/map/") || sequence < 7;
+    copy(&town(), &shorter, |topic, sequence, data| is_early(topic, sequence).then_some(data));
+    let (town, file) = (town().display().to_string(), shorter.display().to_string());
+    assert_eq!(verified(&[&town, "--against", &file]).0, 1, "a whole recording that lacks maps differs");
+    let bytes = fs::read(&shorter).unwrap();
+    fs::write(&shorter, &bytes[..bytes.len() - 20]).unwrap();
+    let output = clearway(&["verify", &town, "--against", &file]);
+    let table = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(2), "{table}");
+    assert!(table.contains("equal; 18 maps of one side only; ") && table.contains("shorter.mcap is cut"), "{table}");
+}
+
+#[test]
 fn another_drive_with_the_same_stamps_is_not_compared_as_if_it_were_a_change() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).display().to_string();
@@ -213,13 +229,24 @@ fn a_report_is_written_when_no_file_matches() {
 #[test]
 fn the_sum_counts_a_file_that_is_cut_apart_from_those_that_are_not_checked() {
     let folder = tempfile::tempdir().unwrap();
-    let cut = folder.path().join("cut.mcap");
+    let cut = folder.path().join("cut.mcap").display().to_string();
     let bytes = fs::read(town()).unwrap();
-    fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
-    let output = clearway(&["verify", cut.to_str().unwrap()]);
-    let table = text(&output.stdout);
-    assert_eq!(output.status.code(), Some(2), "{table}");
-    assert!(table.contains("1 file: 0 equal, 0 different, 1 equal but not whole, 0 not checked"), "{table}");
+    for (part, arguments, sum) in [
+        (bytes.len() / 20 * 19, &["verify", &cut][..], "1 equal but not whole, 0 not checked"),
+        // Its first chunk is cut, so that it has no event.
+        (bytes.len() / 2, &["verify", &cut], "0 equal but not whole, 1 not checked"),
+        (
+            bytes.len() / 2,
+            &["verify", &cut, "--set", "vehicle.maps.valid_ms=500"],
+            "0 equal but not whole, 1 not checked",
+        ),
+    ] {
+        fs::write(&cut, &bytes[..part]).unwrap();
+        let output = clearway(arguments);
+        let table = text(&output.stdout);
+        assert_eq!(output.status.code(), Some(2), "{table}");
+        assert!(table.contains(&format!("1 file: 0 equal, 0 different, {sum}")), "{table}");
+    }
 }
 
 #[test]

@@ -13,7 +13,7 @@ use clearway::encode::as_served;
 use clearway::ingest::queue::Reading;
 use clearway::record::verify::verify;
 use clearway::server::Running;
-use clearway_client::{Client, ClientError, StreamEvent, Subscription};
+use clearway_client::{Client, ClientError, MapStream, MapView, StreamEvent, Subscription};
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;
@@ -123,13 +123,10 @@ async fn maps_as_live_are_the_recorded_ones_moved_by_one_constant_until_the_end(
         assert!(file["page"].as_str().unwrap().starts_with("http://127.0.0.1:"), "{file}");
         let mut stream = Client::connect(&address).await.unwrap().subscribe(Subscription::default()).await.unwrap();
         let mut maps = Vec::new();
-        loop {
-            match stream.next().await {
-                Ok(update) => maps.push(update.map),
-                Err(ClientError::ReplayEnded { .. }) => break maps,
-                Err(other) => panic!("{other}"),
-            }
+        while let Ok(update) = stream.next().await {
+            maps.push(update.map);
         }
+        maps
     };
     let (summary, maps) = replayed(options, test).await;
     assert!(summary.unwrap().reached_end);
@@ -191,6 +188,18 @@ async fn a_seek_to_any_of_a_hundred_moments_gives_the_map_of_the_straight_run() 
     assert!(!summary.unwrap().reached_end, "it was stopped");
 }
 
+/// Reads to the end of the replay; returns the last map.
+async fn to_end(stream: &mut MapStream) -> Option<MapView> {
+    let mut last = None;
+    loop {
+        match stream.next().await {
+            Ok(update) => last = Some(update.map),
+            Err(ClientError::ReplayEnded { .. }) => return last,
+            Err(other) => panic!("{other}"),
+        }
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_step_makes_so_many_maps_and_a_range_ends_and_begins_again() {
     let folder = tempfile::tempdir().unwrap();
@@ -221,15 +230,15 @@ async fn a_step_makes_so_many_maps_and_a_range_ends_and_begins_again() {
         };
         transport.control(request).await.unwrap();
         // It may have been told of a map before the jump.
-        let mut last = None;
-        loop {
-            match stream.next().await {
-                Ok(update) => last = Some(update.map),
-                Err(ClientError::ReplayEnded { .. }) => break,
-                Err(other) => panic!("{other}"),
-            }
-        }
-        let (first_end, boot_id) = (last.as_ref().unwrap().sequence(), last.unwrap().header().boot_id);
+        let mut last = to_end(&mut stream).await;
+        let first_end = last.unwrap().sequence();
+        // Asked again, a stream at the end says so again; at the end, `play` begins the range again.
+        assert!(matches!(stream.next().await, Err(ClientError::ReplayEnded { .. })));
+        let play = v1::ReplayControl { paused: Some(false), ..Default::default() };
+        let again = transport.control(play).await.unwrap().into_inner();
+        assert_eq!((again.phase(), again.position_ns, again.jumps), (v1::ReplayPhase::Playing, from_ns, 2));
+        last = to_end(&mut stream).await;
+        let boot_id = last.unwrap().header().boot_id;
         transport
             .control(v1::ReplayControl { repeat: Some(true), seek_ns: Some(from_ns), ..Default::default() })
             .await
@@ -339,6 +348,10 @@ async fn a_drive_opened_at_a_moment_stands_there_between_its_whole_begin_and_end
         let status = client.vehicles().await.unwrap().remove(0);
         assert!(status.state == "warn" && status.reasons[0] == "the replay is paused", "{:?}", status.reasons);
         assert!(status.map_age_ms.unwrap() < 60_000.0, "by the replay's clock: {:?} ms", status.map_age_ms);
+        let begin = v1::ReplayControl { seek_ns: Some(state.begin_ns), ..Default::default() };
+        assert_eq!(client.replay_control(begin).await.unwrap().maps, [0]);
+        let error = client.newest("", &[]).await.unwrap_err().to_string();
+        assert!(error.contains("has no map yet"), "before the first map there is no newest one: {error}");
     };
     let (summary, tested) = replayed(Options { paused: true, seek: Some(0.4), ..served(&drive) }, test).await;
     tested.expect("the test ran");

@@ -7,6 +7,7 @@ map. A waiting reader is notified when its map becomes stale, also if no further
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -46,6 +47,7 @@ class PassedOver(NamedTuple):
 _RUN_HOLD_NS = 1_000_000_000
 _AHEAD_NS_MAX = 1_000_000_000
 _SKIPPED_MAX_PER_MS, _SKIPPED_MAX = 1, 1000
+_AFTER_END_S = 2.0
 
 
 class MapStream:
@@ -70,6 +72,8 @@ class MapStream:
         self._closed = False
         #: Replays that have reached their end, and those of them after which the iteration has stopped.
         self._replay_ends = self._replay_ends_seen = 0
+        #: True if no map has come since a replay has ended.
+        self._at_end = False
         self._close: Callable[[], None] = lambda: None
 
     def __iter__(self) -> Iterator[Map]:
@@ -77,8 +81,8 @@ class MapStream:
 
     def __next__(self) -> Map:
         """Waits for a map newer than the last one returned, which counts as handled: a replay in lockstep goes on then.
-        Raises the reason if the stream has ended; stops when
-        closed, and once after the last map of a replay: iterate again for the maps of a replay that is set back."""
+        Raises the reason if the stream has ended; stops when closed, and after the last map of a replay. Iterate again
+        for the maps of a replay that is set back: it waits 2 s for them, and then stops again."""
         try:
             return self._next(report_stale=False)
         except ReplayEnded:
@@ -87,7 +91,8 @@ class MapStream:
     def next_or_stale(self) -> Map:
         """Waits for a map newer than the last one returned, or until that one is stale. A stale map is returned again,
         once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. Raises the reason if the
-        stream has ended: `ReplayEnded` at the end of a replay, `ClearwayError` of reason "closed" when closed."""
+        stream has ended: `ReplayEnded` at the end of a replay, as an iteration stops there, `ClearwayError` of reason
+        "closed" when closed."""
         try:
             return self._next(report_stale=True)
         except StopIteration:
@@ -97,7 +102,10 @@ class MapStream:
         with self._changed:
             self._handled = self._seen
             self._changed.notify_all()
+            until = time.monotonic() + _AFTER_END_S
             while not (self._closed or self._is_unseen() or self._ended or self.replay_ended):
+                if self._at_end and time.monotonic() >= until:
+                    raise ReplayEnded
                 last = self._fresh if report_stale else None
                 if last is not None and last.stale:
                     self._fresh = None
@@ -171,7 +179,7 @@ class MapStream:
                 lost = min(lost, skipped)
             before = self._counters
             self._counters = _Counters(before.maps + 1 + skipped, before.lost + lost, before.left_out + left_out)
-            self._newest = m
+            self._newest, self._at_end = m, False
             self._changed.notify_all()
             return True
 
@@ -200,6 +208,7 @@ class MapStream:
         """Records that the replay has ended. For the background thread."""
         with self._changed:
             self._replay_ends += 1
+            self._at_end = True
             self._changed.notify_all()
 
     def on_close(self, close: Callable[[], None]) -> None:

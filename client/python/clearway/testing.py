@@ -63,7 +63,9 @@ class Replay:
         self._folder = tempfile.TemporaryDirectory(prefix="clearway-replay-")
         ready, log = Path(self._folder.name, "ready.json"), Path(self._folder.name, "log.txt")
         command = os.environ.get("CLEARWAY", "clearway")
-        arguments = ["--serve", "--as-live", "--any-port", "--wait-readers", "1", "--ready-file", str(ready)]
+        arguments = ["--serve", "--as-live", "--any-port", "--ready-file", str(ready)]
+        if "--wait-readers" not in options:
+            arguments += ["--wait-readers", "1"]
         try:
             with log.open("w") as stderr:
                 self._server = subprocess.Popen(

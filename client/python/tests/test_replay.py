@@ -30,6 +30,11 @@ def test_a_replay_is_paused_stepped_and_sought(clearway_replay):
         *_, last = maps
         assert last.sequence == drive.state().maps["car"] - 1
         assert drive.state().phase == "ended"
+        # Asked again, the stream says that it is at the end, and does not wait for ever.
+        with pytest.raises(clearway.ReplayEnded):
+            while maps.next_or_stale().stale:
+                pass
+        assert next(maps, None) is None
     for wrong, allowed in [(lambda: drive.seek(99.0), "plays 0.000 s to"), (lambda: drive.speed(0.0), "0.1 to 1000")]:
         with pytest.raises(clearway.ClearwayError, match=allowed):
             wrong()

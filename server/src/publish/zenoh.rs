@@ -111,7 +111,8 @@ impl Publisher {
             let matching =
                 publisher.matching_listener().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             let matches = publisher.matching_status().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
-            self.tasks.spawn(subscribe_while(served.clone(), layer, matches.matching(), matching));
+            let publisher = Arc::new(publisher);
+            self.tasks.spawn(subscribe_while(served.clone(), layer, publisher.clone(), matches.matching(), matching));
             publishers.push((*layer, key.clone(), publisher));
             self.answer(served, layer, key).await?;
         }
@@ -188,10 +189,12 @@ impl Publisher {
     }
 }
 
-/// Keeps a layer active while its key has a subscriber.
+/// Keeps a layer active while its key has a subscriber. The publisher is held, because zenoh logs an error if it ends
+/// before its listener.
 async fn subscribe_while(
     served: Served,
     layer: &'static str,
+    _publisher: Arc<AdvancedPublisher<'static>>,
     mut matches: bool,
     matching: MatchingListener<FifoChannelHandler<MatchingStatus>>,
 ) {
@@ -227,7 +230,7 @@ fn signature(key: Option<&SigningKey>, on: &str, map: &[u8]) -> Option<ZBytes> {
 /// Sends each newest map, and after the last map of a replay that it has ended.
 async fn send_maps(
     served: Served,
-    publishers: Vec<(&'static str, String, AdvancedPublisher<'static>)>,
+    publishers: Vec<(&'static str, String, Arc<AdvancedPublisher<'static>>)>,
     signing_key: Option<Arc<SigningKey>>,
     replay: zenoh::pubsub::Publisher<'static>,
 ) {
@@ -267,7 +270,7 @@ async fn send_maps(
 
 async fn send_map(
     map: &EncodedMap,
-    publishers: &[(&'static str, String, AdvancedPublisher<'static>)],
+    publishers: &[(&'static str, String, Arc<AdvancedPublisher<'static>>)],
     signing_key: Option<&SigningKey>,
 ) {
     for (layer, chunk) in &map.layers {

@@ -158,9 +158,16 @@ pub enum CompareError {
 }
 
 impl Comparison {
-    /// True if every map has its counterpart and no cell changed.
+    /// True if no cell changed and every map has its counterpart; a file that is not whole may lack some.
     pub fn is_equal(&self) -> bool {
-        self.layers.values().all(LayerChange::is_equal)
+        let is_complete = |change: &LayerChange| change.only_before + change.only_after == 0;
+        let is_unchanged = |change: &LayerChange| change.changed + change.values == 0;
+        self.layers.values().all(|change| is_unchanged(change) && (self.incomplete.is_some() || is_complete(change)))
+    }
+
+    /// Number of maps of one side only.
+    pub fn unpaired(&self) -> u64 {
+        self.layers.values().map(|change| change.only_before + change.only_after).sum()
     }
 }
 

@@ -8,7 +8,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 /// faster than a sensor.
 pub const RATES: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
 /// Most maps of one step. Ours: a day of a 10 Hz sensor.
-const STEP_MAX: u32 = 1_000_000;
+pub const STEP_MAX: u32 = 1_000_000;
 
 /// A request that a replay refuses; nothing has changed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -20,7 +20,10 @@ pub enum ControlError {
     #[error("step {0}: 1 to {STEP_MAX} maps are allowed")]
     Step(u32),
     /// A time lies outside the recording, or outside the range that is played.
-    #[error("{what} {at_s:.3} s: the replay plays {from_s:.3} s to {to_s:.3} s, counted from its first event")]
+    #[error(
+        "{what} {} s: the replay plays {} s to {} s, counted from its first event",
+        to_microseconds(*at_s), to_microseconds(*from_s), to_microseconds(*to_s)
+    )]
     Outside {
         /// The field.
         what: &'static str,
@@ -32,7 +35,7 @@ pub enum ControlError {
         to_s: f64,
     },
     /// The range ends before it begins.
-    #[error("from {from_s:.3} s, to {to_s:.3} s: the range must end after it begins")]
+    #[error("from {} s, to {} s: the range must end after it begins", to_microseconds(*from_s), to_microseconds(*to_s))]
     Range {
         /// Begin, in seconds after the first event.
         from_s: f64,
@@ -57,6 +60,13 @@ impl From<ControlError> for tonic::Status {
             ControlError::Over => Self::unavailable(text),
         }
     }
+}
+
+/// A number of seconds with at least three and at most six decimals, so that two that differ look different.
+fn to_microseconds(seconds: f64) -> String {
+    let text = format!("{seconds:.6}");
+    let (milliseconds, rest) = text.split_at(text.len() - 3);
+    format!("{milliseconds}{}", rest.trim_end_matches('0'))
 }
 
 /// Checks a rate.
@@ -88,7 +98,8 @@ pub fn check(
     within("from", request.from_ns, files)?;
     within("to", request.to_ns, files)?;
     let (from, to) = (request.from_ns.unwrap_or(state.from_ns), request.to_ns.unwrap_or(state.to_ns));
-    if from >= to {
+    // A drive of one scan begins and ends at once.
+    if from >= to && (request.from_ns.is_some() || request.to_ns.is_some()) {
         return Err(ControlError::Range { from_s: seconds(from), to_s: seconds(to) });
     }
     within("seek", request.seek_ns, (from, to))?;
@@ -179,10 +190,13 @@ mod tests {
             refused(seek(99_000_000_000)),
             "seek 99.000 s: the replay plays 0.000 s to 12.000 s, counted from its first event"
         );
+        assert!(refused(seek(12_000_100_000)).starts_with("seek 12.0001 s: the replay plays 0.000 s to 12.000 s"));
         for rate in [0.0, -1.0, f64::NAN, 0.05, 1e6] {
             let text = refused(v1::ReplayControl { rate: Some(rate), ..Default::default() });
             assert!(text.contains("0.1 to 1000 is allowed"), "{text}");
         }
+        let one_scan = v1::ReplayState::default();
+        assert_eq!(check(&v1::ReplayControl::default(), &one_scan, false), Ok((0, 0)));
         let range = v1::ReplayControl { from_ns: Some(5), to_ns: Some(5), ..Default::default() };
         assert!(refused(range).contains("must end after it begins"));
         assert!(refused(v1::ReplayControl { step: Some(0), ..Default::default() }).contains("1 to 1000000"));

@@ -51,6 +51,8 @@ pub struct PlayerOptions {
     pub is_recorded: bool,
     /// Ends after the end of the range.
     pub exits_at_end: bool,
+    /// Pauses before the first reading, after the readers that it waits for have come.
+    pub begins_paused: bool,
     /// Longest wait for the acknowledgement of a map in lockstep.
     pub acknowledge_timeout: Duration,
     /// The boot id that maps are served with, if their header differs from the recorded one; each jump adds 1.
@@ -186,7 +188,8 @@ impl Player {
             let readers: u32 = self.vehicles.iter().map(|vehicle| vehicle.engine.status.readers_sum()).sum();
             if readers >= self.state.readers_awaited {
                 self.state.readers_awaited = 0;
-                self.set_phase(ReplayPhase::Playing);
+                let paused = self.options.begins_paused;
+                self.set_phase(if paused { ReplayPhase::Paused } else { ReplayPhase::Playing });
             } else if self.wait(Instant::now() + POLL)?.is_err() {
                 return Ok(Err(Stopped));
             }
@@ -403,12 +406,16 @@ impl Player {
         match (request.step, request.paused) {
             (Some(_), _) => self.set_phase(ReplayPhase::Playing),
             (None, Some(true)) => self.set_phase(ReplayPhase::Paused),
-            (None, Some(false)) if self.state.phase() != ReplayPhase::Ended => self.set_phase(ReplayPhase::Playing),
-            // The range may have grown.
-            (None, _) if self.state.phase() == ReplayPhase::Ended && position_ns < to_ns => {
-                self.set_phase(ReplayPhase::Paused)
+            // At the end of the range it begins again.
+            (None, Some(false)) if self.state.phase() == ReplayPhase::Ended && position_ns >= to_ns => {
+                self.jump(from_ns, true)?;
             }
-            (None, _) => {}
+            (None, Some(false)) => self.set_phase(ReplayPhase::Playing),
+            // The range may have grown.
+            (None, None) if self.state.phase() == ReplayPhase::Ended && position_ns < to_ns => {
+                self.set_phase(ReplayPhase::Playing);
+            }
+            (None, None) => {}
         }
         self.clock.restart();
         self.report();

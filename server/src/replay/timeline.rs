@@ -61,18 +61,19 @@ pub struct Remarks {
 }
 
 impl Timeline {
-    /// Recorded time of the first and of the last reading; `None` without readings. Reads all files.
+    /// Recorded time of the first and of the last reading, `None` without readings, and what the files have beside.
+    /// Reads all files.
     ///
     /// # Errors
     /// [`FilesError`] if a file cannot be read.
-    pub fn extent(&self) -> Result<Option<(i64, i64)>, FilesError> {
+    pub fn extent(&self) -> Result<(Option<(i64, i64)>, Remarks), FilesError> {
         let mut merged = self.open()?;
         let mut extent: Option<(i64, i64)> = None;
         while let Some(next) = merged.next()? {
             let (begin, end) = extent.unwrap_or((merged.begin_ns.unwrap_or(next.at_ns), next.at_ns));
             extent = Some((begin.min(next.at_ns), end.max(next.at_ns)));
         }
-        Ok(extent)
+        Ok((extent, merged.remarks()))
     }
 
     /// Starts to read ahead, after the first `skipped` readings.

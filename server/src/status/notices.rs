@@ -9,7 +9,8 @@ use clearway_mapping::sensor::mount::check::MountDeviation;
 /// What was logged of each sensor of one vehicle, by name.
 #[derive(Debug, Default)]
 pub(super) struct Notices {
-    elevations: BTreeMap<String, ElevationSource>,
+    /// Sensors with each source of their elevations: after a jump of a replay a sensor begins with the first one again.
+    elevations: BTreeSet<(String, ElevationSource)>,
     reference_sensor: String,
     /// Number of the epoch of each sensor.
     epochs: BTreeMap<String, u32>,
@@ -36,10 +37,10 @@ impl Notices {
     }
 
     fn update_elevations(&mut self, vehicle: &str, sensor: &NamedStatus) {
-        let Some(source) = sensor.elevations.filter(|source| self.elevations.get(&sensor.name) != Some(source)) else {
+        let Some(source) = sensor.elevations else { return };
+        if !self.elevations.insert((sensor.name.clone(), source)) {
             return;
-        };
-        self.elevations.insert(sensor.name.clone(), source);
+        }
         let (name, elevations) = (&sensor.name, source.as_str());
         match source.advice() {
             Some(advice) => tracing::warn!(vehicle, sensor = %name, elevations, "{advice}"),
@@ -87,14 +88,14 @@ fn describe(deviation: &MountDeviation) -> String {
 mod tests {
     use super::*;
 
-    fn sensor(height_m: f64, contradicts: bool) -> NamedStatus {
+    fn sensor(height_m: f64, contradicts: bool, elevations: ElevationSource) -> NamedStatus {
         let mount = Some(MountDeviation { height_m, contradicts, scans: 20, ..MountDeviation::default() });
         NamedStatus {
             source: 0,
             name: "top".to_owned(),
             is_reference: true,
             status: clearway_lidar::SensorStatus::default(),
-            elevations: Some(ElevationSource::Nominal),
+            elevations: Some(elevations),
             mount,
             ledger: clearway_mapping::ledger::Ledger::default(),
         }
@@ -119,11 +120,14 @@ mod tests {
         tracing::subscriber::with_default(subscriber, || {
             let mut notices = Notices::default();
             for contradicts in [false, true, true, false, false, true] {
-                notices.update("car", &[sensor(-0.58, contradicts)]);
+                for elevations in [ElevationSource::Nominal, ElevationSource::StatusBytes] {
+                    notices.update("car", &[sensor(-0.58, contradicts, elevations)]);
+                }
             }
         });
         let text = String::from_utf8(lines.0.lock().unwrap().clone()).unwrap();
         assert_eq!(text.matches("off by 0.33 m in the median").count(), 1, "{text}");
+        assert_eq!(text.matches("status_bytes").count(), 1, "{text}");
         assert_eq!(text.matches(" m lower than configured").count(), 2, "{text}");
         assert_eq!(text.matches("fits the configured mount again").count(), 1, "{text}");
     }

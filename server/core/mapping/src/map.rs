@@ -118,7 +118,7 @@ impl Contribution {
 
 /// The source of the elevations of a sensor's lasers. They define the rows of radial maps, and for a sensor that sends
 /// packets also the heights of all points.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ElevationSource {
     /// The configured calibration table of the sensor.
     Table,

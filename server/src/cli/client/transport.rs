@@ -6,8 +6,10 @@ use clearway_client::ClientError;
 use clearway_client::v1::{ReplayControl, ReplayState};
 
 use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::make::replay::options::offset;
 use crate::cli::make::replay::{Speed, state};
-use crate::cli::shared::output::{block_on, print_line};
+use crate::cli::shared::output::{block_on, print_line, usage_error};
+use crate::replay::control::STEP_MAX;
 
 /// Control the replay of a server: pause, play, step, seek, range, speed, loop, lockstep.
 #[derive(Args)]
@@ -39,22 +41,22 @@ enum Request {
     /// Make this many maps, and pause; the answer comes when they are made. A seek meanwhile ends the step.
     Step {
         /// Number of maps.
-        #[arg(default_value = "1")]
+        #[arg(default_value = "1", value_parser = clap::value_parser!(u32).range(1..=i64::from(STEP_MAX)))]
         maps: u32,
     },
     /// Jump to this time. A paused replay stays paused there; one that has ended plays on.
     Seek {
         /// Seconds after the first event, from 0 on.
-        #[arg(allow_negative_numbers = true)]
+        #[arg(allow_negative_numbers = true, value_parser = offset)]
         seconds: f64,
     },
     /// Play only this part; --all plays the whole drive again.
     Range {
         /// Begin, in seconds after the first event.
-        #[arg(required_unless_present = "all", allow_negative_numbers = true)]
+        #[arg(required_unless_present = "all", allow_negative_numbers = true, value_parser = offset)]
         from: Option<f64>,
         /// End, in seconds after the first event.
-        #[arg(required_unless_present = "all", allow_negative_numbers = true)]
+        #[arg(required_unless_present = "all", allow_negative_numbers = true, value_parser = offset)]
         to: Option<f64>,
         /// The whole drive.
         #[arg(long, conflicts_with_all = ["from", "to"])]
@@ -93,6 +95,11 @@ fn on_or_off(text: &str) -> Result<bool, String> {
 /// # Errors
 /// If the server does not answer, serves no replay, or refuses the change.
 pub fn run(options: &Options) -> Result<()> {
+    if let Some(Request::Range { from: Some(from), to: Some(to), .. }) = options.request
+        && from >= to
+    {
+        return Err(usage_error(format!("range {from} {to}: the range must end after it begins")));
+    }
     block_on(control(options))
 }
 
@@ -106,32 +113,29 @@ async fn control(options: &Options) -> Result<()> {
     };
     let replay = match options.request {
         None => replay,
-        Some(request) => client.replay_control(request.to_control(&replay)?).await.map_err(explain)?,
+        Some(request) => client.replay_control(request.to_control(&replay)).await.map_err(explain)?,
     };
     print_line(&if options.json { state::json(&replay) } else { state::line(&replay) })?;
     Ok(())
 }
 
 impl Request {
-    fn to_control(self, state: &ReplayState) -> Result<ReplayControl> {
-        let at = |seconds: f64| match seconds.is_finite() {
-            // Saturates: what lies outside the drive is refused by the server.
-            true => Ok(Some(state.begin_ns.saturating_add((seconds * 1e9) as i64))),
-            false => bail!("{seconds} s: a finite number of seconds is allowed"),
-        };
+    fn to_control(self, state: &ReplayState) -> ReplayControl {
+        // Saturates: what lies outside the drive is refused by the server.
+        let at = |seconds: f64| Some(state.begin_ns.saturating_add((seconds * 1e9) as i64));
         let nothing = ReplayControl::default();
-        Ok(match self {
+        match self {
             Self::Play => ReplayControl { paused: Some(false), ..nothing },
             Self::Pause => ReplayControl { paused: Some(true), ..nothing },
             Self::Step { maps } => ReplayControl { step: Some(maps), ..nothing },
-            Self::Seek { seconds } => ReplayControl { seek_ns: at(seconds)?, ..nothing },
+            Self::Seek { seconds } => ReplayControl { seek_ns: at(seconds), ..nothing },
             Self::Range { from: Some(from), to: Some(to), .. } => {
-                ReplayControl { from_ns: at(from)?, to_ns: at(to)?, ..nothing }
+                ReplayControl { from_ns: at(from), to_ns: at(to), ..nothing }
             }
             Self::Range { .. } => ReplayControl { from_ns: Some(state.begin_ns), to_ns: Some(state.end_ns), ..nothing },
             Self::Rate { rate } => ReplayControl { rate: Some(rate.rate()), ..nothing },
             Self::Loop { on } => ReplayControl { repeat: Some(on), ..nothing },
             Self::Lockstep { on } => ReplayControl { lockstep: Some(on), ..nothing },
-        })
+        }
     }
 }

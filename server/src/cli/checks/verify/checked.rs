@@ -65,14 +65,16 @@ impl Checked {
         Self { file, seconds: 0.0, outcome, pictures: Vec::new() }
     }
 
-    /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole or
-    /// has no event, else [`Exit::Good`].
+    /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole, has
+    /// no event or no map to compare, else [`Exit::Good`].
     pub fn exit(&self) -> Exit {
         match &self.outcome {
             Outcome::Verified(report) if report.different > 0 => Exit::Differs,
             Outcome::Verified(report) => Exit::from_incomplete(!report.is_good() || report.incomplete.is_some()),
             Outcome::Compared(comparison) if !comparison.is_equal() => Exit::Differs,
-            Outcome::Compared(comparison) => Exit::from_incomplete(comparison.incomplete.is_some()),
+            Outcome::Compared(comparison) => {
+                Exit::from_incomplete(comparison.incomplete.is_some() || comparison.before + comparison.after == 0)
+            }
             Outcome::Unreadable(_) => Exit::Unreadable,
         }
     }
@@ -92,7 +94,12 @@ impl Checked {
             Outcome::Compared(comparison) => comparison.incomplete.as_ref(),
             Outcome::Unreadable(_) => None,
         };
-        self.exit() == Exit::Unreadable && incomplete.is_some()
+        let is_empty = match &self.outcome {
+            Outcome::Verified(report) => report.events == 0,
+            Outcome::Compared(comparison) => comparison.before + comparison.after == 0,
+            Outcome::Unreadable(_) => true,
+        };
+        self.exit() == Exit::Unreadable && incomplete.is_some() && !is_empty
     }
 
     /// True if the whole file was checked and all its maps are equal.

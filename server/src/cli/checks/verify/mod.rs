@@ -35,7 +35,7 @@ mod table;
 #[derive(Args)]
 #[command(
     after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
-no event, or is another drive than that of --against or has no map in common with it, 3 wrong use.
+no event or no map to compare, or is another drive than that of --against or has no map in common with it, 3 wrong use.
 
 Examples:
   clearway verify drive.mcap
@@ -52,7 +52,7 @@ pub struct Options {
     #[arg(required = true, value_name = "FILES")]
     files: Vec<String>,
     /// Check part I of N of the files: every N-th of the sorted list, from the I-th on. All parts together are all
-    /// files.
+    /// files; a part without files is no error.
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
     /// Number of files that are checked at the same time; the number of processors if absent.

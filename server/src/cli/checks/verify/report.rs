@@ -43,7 +43,14 @@ pub fn reason(outcome: &Outcome) -> String {
             result + &unjudged + &dropped + &repaired + &incomplete.collect::<String>()
         }
         Outcome::Compared(comparison) => {
-            let result = if comparison.is_equal() { "equal".to_owned() } else { first_change(comparison) };
+            let result = match comparison {
+                Comparison { before: 0, after: 0, .. } => "no map on either side, so nothing is compared".to_owned(),
+                equal if equal.is_equal() && equal.unpaired() > 0 => {
+                    format!("equal; {} of one side only", counted(equal.unpaired(), "map"))
+                }
+                equal if equal.is_equal() => "equal".to_owned(),
+                changed => first_change(changed),
+            };
             let incomplete = comparison.incomplete.iter().map(|how| format!("; {how}"));
             result + &incomplete.collect::<String>()
         }

@@ -30,12 +30,13 @@ use crate::cli::make::serve::log_endpoints;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, print, print_line, stop_signal, usage_error};
 use crate::config::{Config, Vehicle};
+use crate::ingest::files::Truncated;
 use crate::replay::ReplayHandle;
 use crate::replay::control::check;
 use crate::replay::faults::Faults;
 use crate::replay::outcome::Played;
 use crate::replay::player::{BEHIND_MAX, Player, PlayerOptions, ReplayedVehicle};
-use crate::replay::timeline::Timeline;
+use crate::replay::timeline::{Remarks, Timeline};
 use crate::server::{Running, Server, Setup, random};
 
 pub mod clouds;
@@ -216,6 +217,7 @@ pub async fn replay(
         is_served: options.serve,
         is_recorded: options.record.is_some(),
         exits_at_end: options.exit_at_end,
+        begins_paused: options.paused,
         acknowledge_timeout: Duration::from_secs_f64(options.lockstep_timeout.unwrap_or(ACKNOWLEDGE_S_MAX)),
         boot_id: first_boot_id,
     };
@@ -266,12 +268,18 @@ pub async fn replay(
     Ok(summary)
 }
 
-/// Recorded time of the first and the last event. Reads the files once if that time matters.
+/// Recorded time of the first and the last event. Reads the files once if that time matters, and logs then which of
+/// them are not whole: a served replay may never come to its summary.
 fn extent(options: &Options, timeline: &Timeline) -> Result<Option<(i64, i64)>, ReplayError> {
     let has_range = options.from.is_some() || options.to.is_some();
     let has_fault = !options.faults.is_empty() || options.fault_script.is_some() || options.fault_seed.is_some();
     if options.serve || has_range || has_fault {
-        return Ok(Some(timeline.extent()?.ok_or(ReplayError::Empty)?));
+        let (extent, Remarks { truncated, .. }) = timeline.extent()?;
+        for Truncated { file, reason } in &truncated {
+            tracing::warn!(file = %file.display(), "not whole: {reason}; the rest is used");
+        }
+        let why = || truncated.iter().map(|of| format!("; {}: {}", of.file.display(), of.reason)).collect();
+        return Ok(Some(extent.ok_or_else(|| ReplayError::Empty { truncated: why() })?));
     }
     Ok(None)
 }

@@ -245,8 +245,11 @@ pub enum ReplayError {
     #[error("--{0}")]
     Control(#[from] ControlError),
     /// The files have no events.
-    #[error("the files have no events to serve")]
-    Empty,
+    #[error("the files have no events to serve{truncated}")]
+    Empty {
+        /// Which of them are truncated and how, for people; empty if none.
+        truncated: String,
+    },
     /// A fault is not known.
     #[error(transparent)]
     Fault(#[from] FaultError),
