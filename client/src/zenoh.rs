@@ -1,4 +1,5 @@
-//! Maps over zenoh: keys `clearway/<vehicle>/map/<layer>`, liveliness tokens `clearway/<vehicle>`.
+//! Maps over zenoh: keys `clearway/<vehicle>/map/<layer>`, the end of a replay on `clearway/<vehicle>/replay`,
+//! liveliness tokens `clearway/<vehicle>`.
 //!
 //! In: the endpoint of a router or server. Out: the same [`MapView`], [`MapStream`] and [`Ingester`] as over gRPC. It
 //! needs tokio's multi-thread runtime, because zenoh panics in a current-thread one.
@@ -25,6 +26,7 @@ use crate::stream::{LatestSlot, MapStream};
 use crate::view::MapView;
 
 mod query;
+mod replay;
 mod subscription;
 
 use query::{LayerKey, QUERY_TIMEOUT, failed};
@@ -126,7 +128,7 @@ impl ZenohClient {
 
     /// Streams one layer of one vehicle, starting with the newest map if there is one. The stream does not end with the
     /// server: [`MapStream::next_or_stale`] reports that its map is stale, and continues with the maps of the next
-    /// server. Nor does it end with a message that is no valid map: it is counted ([`MapStream::passed_over`]).
+    /// server, but for a replay, whose end it reports as over gRPC. Nor does it end with a message that is no valid map: it is counted ([`MapStream::passed_over`]).
     ///
     /// # Errors
     /// [`ClientError::Zenoh`] if the subscription fails.
@@ -135,10 +137,11 @@ impl ZenohClient {
         let (slot, key) = (LatestSlot::new(Clock::default()), layer.key.clone());
         let subscription = LayerSubscription::open(&self.session, layer, slot.clone()).await;
         let subscription = subscription.map_err(failed(format!("subscribe to {key}")))?;
+        let replay = replay::subscribe(&self.session, vehicle, slot.clone(), &self.endpoint).await?;
         // A session closes with its last clone and ends its subscriptions, so the stream keeps a clone.
         let Self { session, endpoint: address, .. } = self.clone();
         Ok(MapStream::of_slot(&slot, async move {
-            let _session = session;
+            let (_session, _replay) = (session, replay);
             subscription.closed().await;
             ClientError::Ended { address }
         }))

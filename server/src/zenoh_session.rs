@@ -136,7 +136,7 @@ fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config,
 /// a publication on a key with wildcards through; Clearway's clients pass over it.
 fn own_keys<'a>(vehicles: impl Iterator<Item = &'a str>) -> serde_json::Value {
     let keys = |vehicle| {
-        ["", "/status", "/ingest/report", "/map/**", "/map/*/@adv/**", "/recorder/*"]
+        ["", "/status", "/ingest/report", "/replay", "/map/**", "/map/*/@adv/**", "/recorder/*"]
             .map(|rest| format!("clearway/{vehicle}{rest}"))
     };
     let keys: Vec<_> = vehicles.flat_map(keys).collect();

@@ -2,6 +2,7 @@
 
 mod common;
 
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
@@ -9,13 +10,16 @@ use common::{clearway, text};
 
 const TOWN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../client/golden/town.mcap");
 
-/// A served replay that ends at its end, and the address of its gRPC.
+/// A served replay of the town that waits for a reader and ends at its end, and the address of its gRPC.
 fn served(folder: &Path, options: &[&str]) -> (Child, String) {
+    started(folder, &[&[TOWN, "--wait-readers", "1", "--exit-at-end"], options].concat())
+}
+
+/// A served replay, and the address of its gRPC.
+fn started(folder: &Path, options: &[&str]) -> (Child, String) {
     let ready = folder.join("ready.json");
-    let serve = ["--serve", "--as-live", "--any-port", "--wait-readers", "1", "--exit-at-end", "--ready-file"];
     let mut server = Command::new(env!("CARGO_BIN_EXE_clearway"))
-        .args(["replay", TOWN])
-        .args(serve)
+        .args(["replay", "--serve", "--as-live", "--any-port", "--ready-file"])
         .arg(&ready)
         .args(options)
         .stderr(Stdio::piped())
@@ -42,6 +46,68 @@ fn a_drive_without_a_map_fails_the_replay_and_its_reader() {
     let error = text(&ended.stderr);
     assert_eq!(ended.status.code(), Some(2), "{error}");
     assert!(error.contains("made no map: of 769 received 0 were decoded and 678 (678 for block_flag)"), "{error}");
+}
+
+#[test]
+fn a_drive_without_a_map_says_so_at_its_end_although_it_is_served_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut server, _) = started(folder.path(), &[TOWN, "--model", "hdl64e_s3", "--speed", "max"]);
+    let log = BufReader::new(server.stderr.take().unwrap());
+    let why = "the whole drive made no map: of 769 received";
+    let found = log.lines().any(|line| line.unwrap().contains(why));
+    server.kill().unwrap();
+    server.wait().unwrap();
+    assert!(found, "the log ends without the reason");
+}
+
+#[test]
+fn a_drive_of_one_scan_is_controlled_and_begins_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let scan = folder.path().join("0000000000.bin");
+    let point = |i: u16| [f32::from(i % 100) * 0.2, f32::from(i / 100) * 0.2, -1.7, 0.5];
+    let bytes: Vec<u8> = (0..10_000).flat_map(point).flat_map(f32::to_le_bytes).collect();
+    std::fs::write(&scan, bytes).unwrap();
+    let options = [scan.to_str().unwrap(), "--extrinsics", "0,0,1.7,0,0,0", "--loop"];
+    let (mut server, address) = started(folder.path(), &options);
+    loop {
+        let output = clearway(&["transport", "--server", &address, "--json"]);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        let state: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        if state["phase"] == "ended" {
+            assert_eq!(state["jumps"], 0, "{state}");
+            break;
+        }
+    }
+    server.kill().unwrap();
+    server.wait().unwrap();
+}
+
+#[test]
+fn of_recordings_of_several_vehicles_those_of_the_named_one_are_replayed() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    let truck = include_str!("../../deploy/clearway.toml").replace("name = \"car\"", "name = \"truck\"");
+    std::fs::write(at("truck.toml"), truck).unwrap();
+    for arguments in [
+        &["simulate", "flat", "--sensor", "vlp16", "--seconds", "0.3", "--out", &at("truck.pcap")][..],
+        &["replay", &at("truck.pcap"), "--config", &at("truck.toml"), "--record", &at("truck.mcap")],
+    ] {
+        let output = clearway(arguments);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+    }
+    let output = clearway(&["replay", TOWN, &at("truck.mcap"), "--vehicle", "truck", "--json"]);
+    let said = text(&output.stderr);
+    assert!(output.status.success() && said.contains("town.mcap") && said.contains("left out"), "{said}");
+    let output = clearway(&["replay", TOWN, &at("truck.mcap"), "--vehicle", "van"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("--vehicle van"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn a_view_from_beyond_the_end_is_refused_by_the_name_of_its_option() {
+    let output = clearway(&["view", TOWN, "--from", "99"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("--from 99.000 s: the replay plays 0.000 s to"), "{}", text(&output.stderr));
 }
 
 #[test]

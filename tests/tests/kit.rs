@@ -7,7 +7,8 @@ use std::path::Path;
 use std::process::Command;
 
 use clearway_client::test::{Replay, town};
-use clearway_client::{Footprint, StreamEvent, Subscription, now_ns, v1};
+use clearway_client::zenoh::ZenohClient;
+use clearway_client::{ClientError, Footprint, StreamEvent, Subscription, now_ns, v1};
 use clearway_tests::{binaries, run, workspace};
 
 #[tokio::test]
@@ -53,6 +54,38 @@ async fn a_replay_is_paused_and_stepped_and_its_exit_status_and_log_are_known() 
     let status = drive.wait().unwrap();
     assert!(read > 2 && status.success(), "{read} maps, {status}: {}", drive.log());
     assert!(drive.log().contains("INFO"), "{}", drive.log());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_reader_over_zenoh_learns_that_a_replay_has_ended_and_why_one_in_lockstep_has_failed() {
+    binaries();
+    let drive = Replay::with(town(), &["--speed", "max"]).unwrap();
+    let client = ZenohClient::connect(&drive.zenoh).await.unwrap();
+    let mut maps = client.subscribe("car", "drivability").await.unwrap();
+    let mut last = None;
+    let ended = loop {
+        match maps.next().await {
+            Ok(update) => last = Some(update.map.sequence()),
+            Err(ended) => break ended,
+        }
+    };
+    assert!(matches!(ended, ClientError::ReplayEnded { .. }) && last == Some(9), "{ended} after {last:?}");
+    // One that comes later gets the last map, and then the end.
+    let mut late = client.subscribe("car", "drivability").await.unwrap();
+    while let Ok(update) = late.next().await {
+        assert_eq!(update.map.sequence(), 9);
+    }
+    assert!(matches!(late.next().await, Err(ClientError::ReplayEnded { .. })));
+
+    let drive = Replay::with(town(), &["--lockstep", "--lockstep-timeout", "0.5"]).unwrap();
+    let client = ZenohClient::connect(&drive.zenoh).await.unwrap();
+    let mut maps = client.subscribe("car", "drivability").await.unwrap();
+    let failed = loop {
+        if let Err(failed) = maps.next().await {
+            break failed.to_string();
+        }
+    };
+    assert!(failed.contains("map 0 of vehicle car was not acknowledged within 0.5 s"), "{failed}");
 }
 
 /// The code blocks of the README's section, by language.

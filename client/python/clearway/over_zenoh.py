@@ -1,4 +1,5 @@
-"""Maps over zenoh: `zenoh:tcp/HOST:PORT`. Keys `clearway/<vehicle>/map/<layer>`, liveliness `clearway/<vehicle>`.
+"""Maps over zenoh: `zenoh:tcp/HOST:PORT`. Keys `clearway/<vehicle>/map/<layer>`, the end of a replay on
+`clearway/<vehicle>/replay`, liveliness `clearway/<vehicle>`.
 
 Each layer has its own key; a map is complete when all selected layers with one sequence number have arrived. The
 publisher's cache gives the current map to a new subscriber, and again after a lost connection is restored. Lost maps
@@ -12,6 +13,7 @@ from __future__ import annotations
 import atexit
 import json
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -35,6 +37,8 @@ _MISSES_KEPT = 1024
 _SAMPLES_KEPT = 64
 #: Most maps of which some layers have arrived. Ours: layers of one map arrive together.
 _MAPS_BEGUN_MAX = 16
+#: Longest wait for the last map of a replay that has ended.
+_LAST_MAP_S = 1.0
 #: Settings of every session; client/src/zenoh.rs has the reasons.
 _SETTINGS = {
     "mode": "client",
@@ -167,6 +171,7 @@ def watch(
     try:
         for layer in writer.layers:
             threads += _LayerSubscription(session, _LayerKey(vehicle, layer, server), writer).threads
+        threads.append(_ReplaySubscription(session, f"clearway/{vehicle}/replay", stream).thread)
     except Exception as error:
         close()
         raise ClearwayError("zenoh", f"subscribe to the layers of {vehicle!r}: {error}") from None
@@ -224,6 +229,53 @@ class _LayerSubscription:
             self._number = newest
             for sample in samples:
                 self._writer.add(self._layer, sample)
+
+
+class _ReplaySubscription:
+    """The key of a vehicle's replay -> its end, after its last map."""
+
+    def __init__(self, session: zenoh.Session, key: str, stream: MapStream) -> None:
+        import zenoh
+
+        self._session, self._key, self._stream, self._told = session, key, stream, False
+        self._ends = session.declare_subscriber(key, zenoh.handlers.RingChannel(_SAMPLES_KEPT))
+        self.thread = threading.Thread(target=self._read, name="clearway watch replay", daemon=True)
+        self.thread.start()
+
+    def _read(self) -> None:
+        import zenoh
+
+        try:
+            # The replay may have ended before.
+            for sample in _replies(self._session, self._key):
+                self._tell(sample)
+        except zenoh.ZError:
+            # The session is being closed.
+            return
+        for sample in self._ends:
+            self._tell(sample)
+
+    def _tell(self, sample: zenoh.Sample) -> None:
+        try:
+            document = json.loads(sample.payload.to_bytes())
+            ended, error = bool(document["ended"]), document.get("error")
+            last = (document.get("boot_id"), document.get("sequence", 0))
+        except (ValueError, KeyError, TypeError, AttributeError):
+            # No message of a server.
+            return
+        was_told, self._told = self._told, ended
+        if error is not None:
+            self._stream.end(ClearwayError("UNAVAILABLE", str(error)))
+        elif ended and not was_told:
+            # Other threads store the maps. One that the link lost does not come.
+            until = time.monotonic() + _LAST_MAP_S
+            while not self._has(*last) and time.monotonic() < until:
+                time.sleep(0.005)
+            self._stream.end_replay()
+
+    def _has(self, boot_id: int | None, sequence: int) -> bool:
+        newest = self._stream.newest()
+        return boot_id is None or newest is not None and newest.header.boot_id == boot_id and newest.sequence >= sequence
 
 
 class _StreamWriter:

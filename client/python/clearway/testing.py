@@ -15,6 +15,7 @@ drive, and `next_or_stale` raises `clearway.ReplayEnded`.
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import tempfile
@@ -117,6 +118,8 @@ class Replay:
     def seek(self, seconds: float) -> ReplayState:
         """Goes to a time after the first event; the newest map of that moment is published at once. A paused replay
         stays paused there, one that has ended plays on."""
+        if not math.isfinite(seconds):
+            raise clearway.ClearwayError("INVALID_ARGUMENT", f"seek {seconds} s: a finite number is allowed")
         return self._control(seek_ns=self._begin_ns() + round(seconds * 1e9))
 
     def speed(self, factor: float) -> ReplayState:

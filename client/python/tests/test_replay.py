@@ -66,3 +66,18 @@ def test_a_reader_over_zenoh_gets_the_maps_too(clearway_replay):
     drive = clearway_replay()
     with clearway.watch(drive.zenoh, vehicle="car", layers=["drivability"]) as maps:
         assert next(maps)["drivability"].classes.any()
+        *_, last = maps
+        assert last.sequence == 9
+    with clearway.watch(drive.zenoh, vehicle="car", layers=["drivability"]) as late:
+        assert [m.sequence for m in late] in ([], [9])
+        with pytest.raises(clearway.ReplayEnded):
+            while late.next_or_stale():
+                pass
+
+
+def test_a_reader_over_zenoh_learns_why_a_replay_in_lockstep_has_failed(clearway_replay):
+    drive = clearway_replay(clearway.testing.TOWN, "--lockstep", "--lockstep-timeout", "0.5")
+    with clearway.watch(drive.zenoh, vehicle="car", layers=["drivability"]) as maps:
+        with pytest.raises(clearway.ClearwayError, match="map 0 of vehicle car was not acknowledged within 0.5 s"):
+            while next(maps):
+                pass

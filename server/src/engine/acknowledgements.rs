@@ -70,6 +70,11 @@ impl Acknowledgements {
         self.timed_out.send_replace(Some(why));
     }
 
+    /// Why the replay ends, if a map was not acknowledged in time.
+    pub fn why_timed_out(&self) -> Option<String> {
+        self.timed_out.borrow().clone()
+    }
+
     /// Names of the readers that have not finished with `map`; `None` if no reader acknowledges.
     pub fn awaited(&self, map: MapId) -> Option<Vec<String>> {
         let readers = locked(&self.readers);

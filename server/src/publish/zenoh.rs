@@ -5,7 +5,9 @@
 //! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
 //! `clearway/<vehicle>/status` has the status once a second and at each change of its state, as JSON; what another
 //! server says there of a vehicle of the same name is in this server's status. `clearway/<vehicle>/replay` has
-//! `{"ended":true}` after the last map of a replay, and `{"ended":false}` when it is set back.
+//! `{"ended":true,"boot_id":B,"sequence":N}` after the last map of a replay, which has these numbers, and
+//! `{"ended":false}` when it is set back; with `"error"` the replay has ended because a map was not acknowledged. The
+//! key answers queries too.
 //!
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
 //!
@@ -53,6 +55,8 @@ pub struct Publisher {
     tokens: Vec<LivelinessToken>,
     tasks: JoinSet<()>,
     signing_key: Option<Arc<SigningKey>>,
+    /// Each vehicle with the publisher of its replay's end.
+    replays: Vec<(Served, Arc<zenoh::pubsub::Publisher<'static>>)>,
 }
 
 impl Publisher {
@@ -63,7 +67,8 @@ impl Publisher {
     /// cannot be declared.
     pub async fn start(session: &Session, options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
         let signing_key = signing_key(&options.signing_key)?.map(Arc::new);
-        let mut publisher = Self { session: session.clone(), tokens: Vec::new(), tasks: JoinSet::new(), signing_key };
+        let (tokens, tasks, replays) = (Vec::new(), JoinSet::new(), Vec::new());
+        let mut publisher = Self { session: session.clone(), tokens, tasks, signing_key, replays };
         for served in vehicles.0.iter() {
             publisher.publish(served).await?;
         }
@@ -80,6 +85,11 @@ impl Publisher {
     /// Stops publishing; the tokens disappear at once.
     pub async fn stop(mut self) {
         self.tasks.shutdown().await;
+        for (served, replay) in &self.replays {
+            if served.status.acknowledgements.why_timed_out().is_some() {
+                put_replay(served, replay).await;
+            }
+        }
         for token in self.tokens {
             if let Err(error) = token.undeclare().await {
                 tracing::warn!(%error, "zenoh: liveliness token");
@@ -128,7 +138,9 @@ impl Publisher {
         let key = format!("clearway/{vehicle}/replay");
         let replay = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON).priority(MAPS);
         let replay = replay.congestion_control(CongestionControl::Drop).await;
-        let replay = replay.map_err(ZenohError::of(format!("publisher {key}")))?;
+        let replay = Arc::new(replay.map_err(ZenohError::of(format!("publisher {key}")))?);
+        self.replays.push((served.clone(), replay.clone()));
+        self.answer_replay(served, key).await?;
         self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay));
         self.watch_claims(served).await?;
         self.tasks.spawn({
@@ -144,6 +156,22 @@ impl Publisher {
                     if let Err(error) = status.put(served.status.to_json().to_string()).await {
                         tracing::warn!(vehicle = %served.status.name, %error, "zenoh: status");
                     }
+                }
+            }
+        });
+        Ok(())
+    }
+
+    /// Answers queries whether the replay has ended.
+    async fn answer_replay(&mut self, served: &Served, key: String) -> Result<(), ZenohError> {
+        let queryable = self.session.declare_queryable(key.clone()).complete(true);
+        let queries = queryable.await.map_err(ZenohError::of(format!("queryable {key}")))?;
+        let served = served.clone();
+        self.tasks.spawn(async move {
+            while let Ok(query) = queries.recv_async().await {
+                let reply = query.reply(&key, replay_document(&served)).encoding(Encoding::APPLICATION_JSON);
+                if let Err(error) = reply.await {
+                    tracing::debug!(%error, "zenoh: reply");
                 }
             }
         });
@@ -232,7 +260,7 @@ async fn send_maps(
     served: Served,
     publishers: Vec<(&'static str, String, Arc<AdvancedPublisher<'static>>)>,
     signing_key: Option<Arc<SigningKey>>,
-    replay: zenoh::pubsub::Publisher<'static>,
+    replay: Arc<zenoh::pubsub::Publisher<'static>>,
 ) {
     let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
     newest.mark_changed();
@@ -259,13 +287,32 @@ async fn send_maps(
         let ended = *replay_ended.borrow();
         if ended != reported && !newest.has_changed().unwrap_or(false) {
             reported = ended;
-            if let Err(error) = replay.put(format!("{{\"ended\":{ended}}}")).await {
-                tracing::warn!(vehicle = %served.status.name, %error, "zenoh: replay");
-            }
+            put_replay(&served, &replay).await;
         }
     }
     // The engine has stopped, but the current map stays in the caches until the session ends.
     std::future::pending::<()>().await;
+}
+
+/// Whether the replay has ended, for its key.
+fn replay_document(served: &Served) -> String {
+    let newest = served.newest.borrow().clone();
+    let why = served.status.acknowledgements.why_timed_out();
+    let mut document = serde_json::json!({ "ended": *served.status.replay_ended.borrow() || why.is_some() });
+    if let Some(map) = newest.filter(|_| document["ended"] == true) {
+        document["boot_id"] = map.boot_id.into();
+        document["sequence"] = map.sequence.into();
+    }
+    if let Some(why) = why {
+        document["error"] = why.into();
+    }
+    document.to_string()
+}
+
+async fn put_replay(served: &Served, replay: &zenoh::pubsub::Publisher<'static>) {
+    if let Err(error) = replay.put(replay_document(served)).await {
+        tracing::warn!(vehicle = %served.status.name, %error, "zenoh: replay");
+    }
 }
 
 async fn send_map(

@@ -37,9 +37,11 @@ pub struct Comparison {
     pub before: u64,
     /// Number of maps after, of one layer each.
     pub after: u64,
-    /// How a file is incomplete, with its name; `None` if both are whole. Maps after missing events may differ for that
-    /// reason alone.
+    /// How a file is incomplete, with its name; `None` if both are whole.
     pub incomplete: Option<String>,
+    /// True if events are missing: the maps after them are not compared with those of a configuration, because they may
+    /// differ for that reason alone.
+    pub is_ended_by_loss: bool,
     /// What changed, by vehicle and layer.
     pub layers: BTreeMap<(String, String), LayerChange>,
     /// The maps with the greatest share of changed cells: that of each layer, greatest first, then the second of each
@@ -161,8 +163,9 @@ impl Comparison {
     /// True if no cell changed and every map has its counterpart; a file that is not whole may lack some.
     pub fn is_equal(&self) -> bool {
         let is_complete = |change: &LayerChange| change.only_before + change.only_after == 0;
+        let may_lack = self.incomplete.is_some() || self.is_ended_by_loss;
         let is_unchanged = |change: &LayerChange| change.changed + change.values == 0;
-        self.layers.values().all(|change| is_unchanged(change) && (self.incomplete.is_some() || is_complete(change)))
+        self.layers.values().all(|change| is_unchanged(change) && (may_lack || is_complete(change)))
     }
 
     /// Number of maps of one side only.
@@ -205,8 +208,16 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
                     pipelines(before, &recording, &recording.config()?.0, None)?
                 }
             };
-            for message in recording.by_ref() {
-                match message? {
+            let losses = recording.loss_count();
+            while let Some(message) = recording.next() {
+                let message = message?;
+                let is_after_gap = matches!(&message, RecordedMessage::Event { vehicle, event }
+                    if vehicles.iter().any(|of| *of.name == **vehicle && of.lacks_events_before(event)));
+                if recording.loss_count() > losses || is_after_gap {
+                    pairs.comparison.is_ended_by_loss = true;
+                    break;
+                }
+                match message {
                     RecordedMessage::Event { vehicle, event } => {
                         for (side, vehicles) in [(BEFORE, &mut recorded), (AFTER, &mut vehicles)] {
                             let Some(computing) = vehicles.iter_mut().find(|v| *v.name == *vehicle) else { continue };
@@ -224,6 +235,8 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
                     | RecordedMessage::Ros { .. } => {}
                 }
             }
+            // How the file ends is known at its end.
+            recording.by_ref().try_for_each(|message| message.map(|_| ()))?;
             pairs.comparison.incomplete = incomplete(before, &recording);
         }
         After::Recording(after) => {
@@ -273,6 +286,11 @@ struct Computing {
 }
 
 impl Computing {
+    /// True if events between the last one and this one are missing. A part of a recording may begin with any event.
+    fn lacks_events_before(&self, event: &Event) -> bool {
+        self.next_event > 0 && event.sequence > self.next_event
+    }
+
     /// The layers of the map that an event completes: name and bytes of each.
     fn step(&mut self, event: &Event) -> Vec<(String, Bytes)> {
         if event.sequence < self.next_event {

@@ -320,7 +320,8 @@ impl Player {
             }
         }
         self.step_waiting(None);
-        if self.state.repeat && self.newest_ns.is_some() {
+        // A drive of one scan has no length: it would begin again without an end.
+        if self.state.repeat && self.newest_ns.is_some() && self.state.from_ns < self.state.to_ns {
             return self.jump(self.state.from_ns, true);
         }
         self.end_step(ReplayPhase::Ended);

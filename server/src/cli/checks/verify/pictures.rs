@@ -18,13 +18,19 @@ const PIXELS: u32 = 480;
 /// If a file cannot be written.
 pub fn draw(result: &mut Checked, folder: &Path) -> Result<()> {
     let Outcome::Compared(comparison) = &result.outcome else { return Ok(()) };
-    let stem = result.file.with_extension("").display().to_string().replace(['/', '\\'], "_");
+    let stem = stem(&result.file);
     for map in &comparison.worst {
         let file = folder.join(format!("{stem}_{:06}_{}_{}.png", map.sequence, map.vehicle, map.after.name));
         files::write(&file, &before_after_change(map)?.to_png()?)?;
         result.pictures.push(file);
     }
     Ok(())
+}
+
+/// The path of a recording as the beginning of a file's name. One that begins with a dot would be hidden.
+fn stem(recording: &Path) -> String {
+    let name = recording.with_extension("").display().to_string().replace(['/', '\\'], "_");
+    name.trim_start_matches(['.', '_']).to_owned()
 }
 
 fn before_after_change(map: &MapChange) -> Result<Picture> {
@@ -40,4 +46,15 @@ fn before_after_change(map: &MapChange) -> Result<Picture> {
         ],
         3,
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_picture_is_hidden() {
+        let names = ["drives/a.mcap", "../drives/a.mcap", "/data/../a.mcap"].map(|file| stem(Path::new(file)));
+        assert_eq!(names, ["drives_a", "drives_a", "data_.._a"]);
+    }
 }

@@ -51,8 +51,10 @@ pub fn reason(outcome: &Outcome) -> String {
                 equal if equal.is_equal() => "equal".to_owned(),
                 changed => first_change(changed),
             };
+            let after_loss =
+                if comparison.is_ended_by_loss { "; maps after missing events cannot be compared" } else { "" };
             let incomplete = comparison.incomplete.iter().map(|how| format!("; {how}"));
-            result + &incomplete.collect::<String>()
+            result + after_loss + &incomplete.collect::<String>()
         }
         Outcome::Unreadable(reason) => format!("not checked: {reason}"),
     }

@@ -32,12 +32,13 @@ use crate::cli::shared::output::{block_on, print, print_line, stop_signal, usage
 use crate::config::{Config, Vehicle};
 use crate::ingest::files::Truncated;
 use crate::replay::ReplayHandle;
-use crate::replay::control::check;
+use crate::replay::control::{ControlError, check};
 use crate::replay::faults::Faults;
 use crate::replay::outcome::Played;
 use crate::replay::player::{BEHIND_MAX, Player, PlayerOptions, ReplayedVehicle};
 use crate::replay::timeline::{Remarks, Timeline};
 use crate::server::{Running, Server, Setup, random};
+use crate::status::VehicleStatus;
 
 pub mod clouds;
 mod keys;
@@ -51,6 +52,7 @@ pub mod summary;
 pub use options::{Options, ReplayError, Speed};
 use plan::{Plan, plan};
 use ready_file::ReadyFile;
+use summary::why_no_map;
 pub use summary::{Mount, Summary, describe};
 
 /// Interval at which the progress bar is drawn again.
@@ -137,7 +139,7 @@ async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Resul
     };
     let has_no_map = serve && summary.reached_end && summary.maps() == 0;
     if has_no_map {
-        eprintln!("clearway: the whole drive made no map: {}", summary.why_no_map());
+        eprintln!("clearway: the whole drive made no map: {}", why_no_map(&summary.mount, &summary.snapshot));
     }
     Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
 }
@@ -237,6 +239,7 @@ pub async fn replay(
             let mut player = tokio::task::spawn_blocking(play);
             tokio::select! {
                 played = &mut player => played,
+                () = warn_without_map(&handle, &summary.mount, &status) => unreachable!("it does not end"),
                 () = stop => {
                     handle.stop();
                     player.await
@@ -266,6 +269,17 @@ pub async fn replay(
     }
     summary.seconds = began.elapsed().as_secs_f64();
     Ok(summary)
+}
+
+/// Logs why a served drive has made no map, when it has ended: it may be killed there, before its summary. Does not
+/// return.
+async fn warn_without_map(replay: &ReplayHandle, mount: &Mount, status: &VehicleStatus) {
+    let has_none =
+        |state: &v1::ReplayState| state.phase() == v1::ReplayPhase::Ended && state.maps.iter().all(|maps| *maps == 0);
+    if replay.state().wait_for(has_none).await.is_ok() {
+        tracing::warn!("the whole drive made no map: {}", why_no_map(mount, &status.snapshot()));
+    }
+    std::future::pending().await
 }
 
 /// Recorded time of the first and the last event. Reads the files once if that time matters, and logs then which of
@@ -340,7 +354,13 @@ fn initial_state(options: &Options, extent: Option<(i64, i64)>) -> Result<v1::Re
     }
     if let Some(seconds) = options.seek {
         let seek = v1::ReplayControl { seek_ns: Some(at(seconds)), ..Default::default() };
-        check(&seek, &state, false)?;
+        // `view --from`, which is the only one that seeks at the start.
+        check(&seek, &state, false).map_err(|error| match error {
+            ControlError::Outside { at_s, from_s, to_s, .. } => {
+                ControlError::Outside { what: "from", at_s, from_s, to_s }
+            }
+            other => other,
+        })?;
         state.position_ns = at(seconds);
     }
     Ok(state)

@@ -16,7 +16,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
-use super::recordings::{Recorded, check_sensors, several_vehicles};
+use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
 use crate::cli::shared::ground_revolutions::{GroundRevolutions, points_of};
 use crate::config::{Calibrations, Config, Origin, RecordedMaps, Recorder};
@@ -65,6 +65,9 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
         && let Some(recordings) = several_vehicles(&files)?
     {
         return plan_several(options, recordings, files.bytes());
+    }
+    if let Some(files) = files_of_vehicle(options, &files)? {
+        return plan(&Options { files, ..options.clone() });
     }
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::options::ReplayError;
+use super::options::{Options, ReplayError};
 use crate::config::{Calibrations, Config, Vehicle};
 use crate::ingest::files::{Kind, Readings};
 use crate::record::reader::RecordingReader;
@@ -36,6 +36,22 @@ pub(super) fn several_vehicles(files: &Readings) -> Result<Option<Vec<Recorded>>
         recordings.push(Recorded { file: file.to_owned(), config, tables, boot_id: recording.header().boot_id });
     }
     Ok((names.len() > 1).then_some(recordings))
+}
+
+/// The recordings of the vehicle that the options name, if some of the files are of other vehicles only; the log names
+/// those.
+pub(super) fn files_of_vehicle(options: &Options, files: &Readings) -> Result<Option<Vec<PathBuf>>, ReplayError> {
+    let Some(name) = options.vehicle.as_ref().filter(|_| options.config.is_none()) else { return Ok(None) };
+    let recordings = several_vehicles(files)?.unwrap_or_default();
+    let has_vehicle = |recording: &Recorded| recording.config.vehicles.iter().any(|vehicle| vehicle.name == *name);
+    let (of_vehicle, of_others): (Vec<_>, Vec<_>) = recordings.into_iter().partition(has_vehicle);
+    if of_vehicle.is_empty() || of_others.is_empty() {
+        return Ok(None);
+    }
+    for other in of_others {
+        tracing::info!(file = %other.file.display(), "left out: it has no vehicle {name}");
+    }
+    Ok(Some(of_vehicle.into_iter().map(|recording| recording.file).collect()))
 }
 
 /// Refuses a configuration whose vehicle or sensors are not those of the recording: events name a sensor by its place.

@@ -58,6 +58,23 @@ pub struct Summary {
     pub reached_end: bool,
 }
 
+/// Why no map was made, as far as the mount and the counts say it.
+pub fn why_no_map(mount: &Mount, snapshot: &Snapshot) -> String {
+    if let Mount::Unknown(why) = mount {
+        return format!("the mount of the sensor is not known: {why}");
+    }
+    let ledger = &snapshot.ledger;
+    let refused = ledger.refused.iter().map(|(reason, n)| format!("{n} for {reason}")).collect::<Vec<_>>();
+    let refused = if refused.is_empty() { String::new() } else { format!(" ({})", refused.join(", ")) };
+    format!(
+        "of {} received {} were decoded and {}{refused} refused; they hold {}",
+        ledger.received,
+        ledger.decoded,
+        snapshot.refused(),
+        counted(snapshot.revolutions(), "revolution")
+    )
+}
+
 impl Summary {
     /// The summary as one JSON object.
     pub fn to_json(&self) -> Value {
@@ -86,23 +103,6 @@ impl Summary {
     /// Number of maps of all vehicles.
     pub fn maps(&self) -> u64 {
         self.snapshot.maps + self.others.iter().map(|(_, snapshot)| snapshot.maps).sum::<u64>()
-    }
-
-    /// Why no map was made, as far as the counts say it.
-    pub fn why_no_map(&self) -> String {
-        if let Mount::Unknown(why) = &self.mount {
-            return format!("the mount of the sensor is not known: {why}");
-        }
-        let ledger = &self.snapshot.ledger;
-        let refused = ledger.refused.iter().map(|(reason, n)| format!("{n} for {reason}")).collect::<Vec<_>>();
-        let refused = if refused.is_empty() { String::new() } else { format!(" ({})", refused.join(", ")) };
-        format!(
-            "of {} received {} were decoded and {}{refused} refused; they hold {}",
-            ledger.received,
-            ledger.decoded,
-            self.snapshot.refused(),
-            counted(self.snapshot.revolutions(), "revolution")
-        )
     }
 
     fn mount_json(&self) -> Value {
