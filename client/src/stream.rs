@@ -163,8 +163,8 @@ impl MapStream {
     /// Why the stream has ended, after its last map was returned; subscribe again then. [`ClientError::Ended`] if the
     /// server ended it, [`ClientError::Unreachable`] if the connection failed, [`ClientError::Refused`] if the server
     /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] after the last map of
-    /// a replay; the stream has not ended then. The next call waits 2 s for a map of a replay that is set back, and then
-    /// says so again.
+    /// a replay; the stream has not ended then. The next call waits 2 s for a map of a replay that is set back, and
+    /// then says so again.
     pub async fn next(&mut self) -> Result<Update, ClientError> {
         self.handled.send_replace(self.seen.map_or(0, |seen| seen.maps));
         loop {

@@ -128,7 +128,8 @@ impl ZenohClient {
 
     /// Streams one layer of one vehicle, starting with the newest map if there is one. The stream does not end with the
     /// server: [`MapStream::next_or_stale`] reports that its map is stale, and continues with the maps of the next
-    /// server, but for a replay, whose end it reports as over gRPC. Nor does it end with a message that is no valid map: it is counted ([`MapStream::passed_over`]).
+    /// server; the end of a replay it reports as over gRPC. Nor does it end with a message that is no valid map: it is
+    /// counted ([`MapStream::passed_over`]).
     ///
     /// # Errors
     /// [`ClientError::Zenoh`] if the subscription fails.

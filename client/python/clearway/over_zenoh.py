@@ -275,7 +275,9 @@ class _ReplaySubscription:
 
     def _has(self, boot_id: int | None, sequence: int) -> bool:
         newest = self._stream.newest()
-        return boot_id is None or newest is not None and newest.header.boot_id == boot_id and newest.sequence >= sequence
+        if boot_id is None or newest is None:
+            return boot_id is None
+        return newest.header.boot_id == boot_id and newest.sequence >= sequence
 
 
 class _StreamWriter:

@@ -103,8 +103,8 @@ impl Engine {
         self.pipeline.newest_map().map_or(0, |map| map.sequence + 1)
     }
 
-    /// Publishes the newest map of a pipeline that was exchanged, or stepped without publishing; if it has none, readers
-    /// have none.
+    /// Publishes the newest map of a pipeline that was exchanged, or stepped without publishing; if it has none,
+    /// readers have none.
     pub fn publish_newest_map(&mut self) {
         if self.pipeline.newest_map().is_none() {
             self.newest.send_replace(None);

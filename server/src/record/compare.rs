@@ -6,20 +6,21 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use bytes::Bytes;
 use clearway_mapping::config::ConfigValueError;
-use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
 use clearway_proto::grid::Grid;
 use clearway_proto::map::{Layer, MapError, decode_map};
 
+use computing::Computing;
+
 use super::reader::{RecordedMessage, RecordingError, RecordingReader};
 use crate::config::{Calibrations, Config, RecordedMaps};
-use crate::encode::EncodedMap;
 use crate::encode::picture::change::{Change, class_name};
+
+mod computing;
 
 /// Where the maps after the change come from.
 pub enum After<'a> {
@@ -274,35 +275,6 @@ fn incomplete(file: &Path, recording: &RecordingReader) -> Option<String> {
 /// The sides of a comparison, as indices.
 const BEFORE: usize = 0;
 const AFTER: usize = 1;
-
-/// One vehicle whose maps are computed.
-struct Computing {
-    name: Arc<str>,
-    boot_id: u64,
-    valid_ms: u32,
-    pipeline: Pipeline,
-    /// Sequence from which events are new; earlier ones are repeated for a keyframe.
-    next_event: u64,
-}
-
-impl Computing {
-    /// True if events between the last one and this one are missing. A part of a recording may begin with any event.
-    fn lacks_events_before(&self, event: &Event) -> bool {
-        self.next_event > 0 && event.sequence > self.next_event
-    }
-
-    /// The layers of the map that an event completes: name and bytes of each.
-    fn step(&mut self, event: &Event) -> Vec<(String, Bytes)> {
-        if event.sequence < self.next_event {
-            return Vec::new();
-        }
-        self.next_event = event.sequence.saturating_add(1);
-        // Refused events make no map, here and in the recorded run.
-        let Ok(Some(map)) = self.pipeline.step(event) else { return Vec::new() };
-        let map = EncodedMap::new(map, self.name.clone(), self.boot_id, self.valid_ms);
-        map.layers.iter().map(|(layer, chunk)| ((*layer).to_owned(), map.layer(chunk))).collect()
-    }
-}
 
 /// The pipelines of a configuration, for the vehicles of a recording.
 fn pipelines(

@@ -8,6 +8,7 @@
 //! | [`control`] | requests of clients -> commands; the state of the replay -> clients |
 //! | [`snapshots`] | pipelines at some moments -> the last one before another moment |
 //! | [`outcome`] | how a replay ended, or why it cannot go on |
+//! | [`vehicle`] | one vehicle: its engine and its queue |
 //! | [`player`] | readings, commands -> stepped engines |
 //!
 //! A jump goes back to a copy of the pipelines and applies every event from there to the requested moment without
@@ -20,5 +21,6 @@ pub mod outcome;
 pub mod player;
 pub mod snapshots;
 pub mod timeline;
+pub mod vehicle;
 
 pub use control::{ControlError, ReplayHandle, ReplayInput};

@@ -3,7 +3,6 @@
 //! One thread does everything, so a pause is a thread that waits, and a jump exchanges pipelines between two steps.
 //! Readings and observations of live clients pass through the vehicles' event queues as ever.
 
-use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use clearway_proto::v1::{self, ReplayPhase};
@@ -14,12 +13,10 @@ use super::control::{Command, ControlError, ReplayInput, Step, check};
 use super::outcome::{PlayError, Played};
 use super::snapshots::{Snapshot, Snapshots};
 use super::timeline::{Ahead, Timeline};
+use super::vehicle::{ReplayedVehicle, report_refused};
 use crate::base::clock::now_ns;
 use crate::base::counted::counted;
-use crate::engine::Engine;
 use crate::ingest::files::FilesError;
-use crate::ingest::files::mcap::RefusedMessages;
-use crate::ingest::queue::{EventQueue, QueuedEvent};
 
 /// Interval at which a waiting replay looks for live observations and readers. Ours: short beside a revolution.
 const POLL: Duration = Duration::from_millis(20);
@@ -31,16 +28,6 @@ const EXACT: Duration = Duration::from_millis(2);
 pub const BEHIND_MAX: Duration = Duration::from_millis(300);
 /// Longest wait for readers to leave after the end, if the replay ends there. Ours: they have been told.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
-
-/// One vehicle of a replay.
-pub struct ReplayedVehicle {
-    /// Its engine.
-    pub engine: Engine,
-    /// The events of its queue.
-    pub events: Receiver<QueuedEvent>,
-    /// Its queue.
-    pub queue: EventQueue,
-}
 
 /// What a replay does besides what clients can change ([`v1::ReplayState`]).
 #[derive(Clone, Copy, Debug)]
@@ -496,12 +483,5 @@ impl Player {
             state.clone_from(&self.state);
             changed
         });
-    }
-}
-
-/// Counts the messages that the files' readers have refused.
-fn report_refused(queue: &EventQueue, refused: RefusedMessages) {
-    for ((source, reason), count) in refused {
-        queue.drops().record_refused_messages(source, reason, count);
     }
 }

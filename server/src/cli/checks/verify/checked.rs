@@ -65,8 +65,8 @@ impl Checked {
         Self { file, seconds: 0.0, outcome, pictures: Vec::new() }
     }
 
-    /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole, has
-    /// no event or no map to compare, else [`Exit::Good`].
+    /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole,
+    /// has no event or no map to compare, else [`Exit::Good`].
     pub fn exit(&self) -> Exit {
         match &self.outcome {
             Outcome::Verified(report) if report.different > 0 => Exit::Differs,

@@ -35,8 +35,9 @@ use crate::replay::ReplayHandle;
 use crate::replay::control::{ControlError, check};
 use crate::replay::faults::Faults;
 use crate::replay::outcome::Played;
-use crate::replay::player::{BEHIND_MAX, Player, PlayerOptions, ReplayedVehicle};
+use crate::replay::player::{BEHIND_MAX, Player, PlayerOptions};
 use crate::replay::timeline::{Remarks, Timeline};
+use crate::replay::vehicle::ReplayedVehicle;
 use crate::server::{Running, Server, Setup, random};
 use crate::status::VehicleStatus;
 
