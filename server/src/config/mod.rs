@@ -102,12 +102,14 @@ pub struct Page {
     pub listen: SocketAddr,
     /// URL at which others reach the page, for pages of other servers; empty: they show its vehicles without a link.
     pub advertise: String,
+    /// Most connections at once; further ones are refused with 503.
+    pub connections_max: usize,
 }
 
 impl Default for Page {
     fn default() -> Self {
         let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8080);
-        Self { enabled: true, listen, advertise: String::new() }
+        Self { enabled: true, listen, advertise: String::new(), connections_max: 256 }
     }
 }
 
@@ -116,6 +118,9 @@ impl Page {
         let is_url = ["http://", "https://"].iter().any(|scheme| self.advertise.starts_with(scheme));
         if !self.advertise.is_empty() && !is_url {
             return Err(ValueError::new("page.advertise", &self.advertise, "http://HOST:PORT/ or https://HOST:PORT/"));
+        }
+        if !(1..=65_536).contains(&self.connections_max) {
+            return Err(ValueError::new("page.connections_max", self.connections_max, "1 to 65536 connections"));
         }
         Ok(())
     }
@@ -366,6 +371,7 @@ impl Config {
         self.grpc.tls.clone_from(&old.grpc.tls);
         self.grpc.access.clone_from(&old.grpc.access);
         self.grpc.connections_max = old.grpc.connections_max;
+        self.page.connections_max = old.page.connections_max;
         let (calls_max, per_address) = (self.connections.calls_max, self.connections.calls_per_address_max);
         self.connections = Connections { calls_max, calls_per_address_max: per_address, ..old.connections.clone() };
         self

@@ -372,7 +372,12 @@ fn an_address_that_other_hosts_can_reach_needs_protection_or_its_name_in_words()
 fn a_reload_changes_certificates_roles_and_limits_and_nothing_else() {
     let config = |option: &str| Config::parse(NEEDED, Path::new("a.toml"), &[option.to_owned()]).unwrap();
     let old = config("grpc.enabled=true");
-    for reloaded in ["grpc.connections_max=7", "connections.idle_s=7", "connections.hosts=[\"car.example\"]"] {
+    for reloaded in [
+        "grpc.connections_max=7",
+        "page.connections_max=7",
+        "connections.idle_s=7",
+        "connections.hosts=[\"car.example\"]",
+    ] {
         assert_eq!(config(reloaded).without_reloaded(&old), old, "{reloaded}");
     }
     for fixed in ["grpc.listen=127.0.0.1:7", "connections.calls_max=7", "vehicle.queue=64"] {

@@ -11,8 +11,8 @@ use crate::publish::foxglove;
 use crate::publish::listen::security::Security;
 use crate::publish::listen::{AllPlaces, Limits, Listener, ListenerHandle, Protocol};
 
-/// Most connections of the page and of Foxglove. Ours: some dozens of browsers with a few connections each.
-const WEB_CONNECTIONS_MAX: usize = 256;
+/// Most connections of Foxglove. Ours: some dozens of people with a few connections each.
+const FOXGLOVE_CONNECTIONS_MAX: usize = 256;
 /// Most connections of the metrics. Ours: some probes and collectors.
 const METRICS_CONNECTIONS_MAX: usize = 64;
 
@@ -83,8 +83,8 @@ pub(super) fn limits(name: &str, config: &Config) -> Limits {
     let (connections_max, allowed_by) = match name {
         "grpc" => (config.grpc.connections_max, "grpc.connections_max"),
         "metrics" => (METRICS_CONNECTIONS_MAX, "the metrics' listener"),
-        "page" => (WEB_CONNECTIONS_MAX, "the page's listener"),
-        _ => (WEB_CONNECTIONS_MAX, "Foxglove's listener"),
+        "page" => (config.page.connections_max, "page.connections_max"),
+        _ => (FOXGLOVE_CONNECTIONS_MAX, "Foxglove's listener"),
     };
     Limits::new(&config.connections, connections_max, allowed_by)
 }

@@ -15,13 +15,13 @@ use super::fixture::{self, config, feed, sequence, start, until, within};
 use super::{Reader, keeps_up, of_layer, plain, portions};
 
 /// A link from the server that passes only the allowed number of bytes.
-struct Link {
-    address: SocketAddr,
-    allowed: Arc<Semaphore>,
+pub struct Link {
+    pub address: SocketAddr,
+    pub allowed: Arc<Semaphore>,
 }
 
 impl Link {
-    async fn to(server: SocketAddr) -> Self {
+    pub async fn to(server: SocketAddr) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let (address, allowed) = (listener.local_addr().unwrap(), Arc::new(Semaphore::new(0)));
         let rate = allowed.clone();

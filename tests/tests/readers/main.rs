@@ -1,6 +1,7 @@
 //! Readers of `Watch` over real sockets: their requests, their updates, and that bad readers do not disturb the others.
 
 mod bad;
+mod browsers;
 #[path = "../fixture/mod.rs"]
 mod fixture;
 

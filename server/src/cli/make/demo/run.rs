@@ -206,6 +206,8 @@ fn configuration(options: &Options, rig: &Rig) -> (Config, Vec<String>) {
     let from = rig.scanners.iter().enumerate().map(sender).filter(|_| many).collect();
     vehicle.udp = Some(Udp { data: any, telemetry: any, from, ..Udp::default() });
     vehicle.maps.speed.enabled |= many;
+    // The page's view in 3-D shows them.
+    vehicle.maps.terrain.planes = true;
     // The rig states where its sensors are.
     if many {
         vehicle.sensors = rig.sensors();
