@@ -127,10 +127,12 @@ mod tests {
     fn a_line_counts_only_without_ground_before_it() {
         let steps = [[5.1, 4.1], [-5.1, 4.1]];
         let none = ([30.0, -30.0], 0.0);
-        assert_eq!(marked(&steps, none, [0.1, 2.5]), 0, "before it");
-        assert_eq!(marked(&steps, none, [0.1, 3.6]), 40, "on its near side, but as near as returns from the step");
-        assert_eq!(marked(&steps, none, [0.1, 6.0]), 40, "beyond it");
-        assert_eq!(marked(&steps, none, [0.1, -2.5]), 40, "on the other side of the vehicle");
+        // Places in the direction of a cell of the line, which is 4.13 m away.
+        let at = |range_m: f32| [0.03 * range_m, range_m];
+        assert_eq!(marked(&steps, none, at(2.5)), 0, "before it");
+        assert_eq!(marked(&steps, none, at(3.6)), 40, "before it, as near as the returns from the step");
+        assert_eq!(marked(&steps, none, at(6.0)), 40, "beyond it");
+        assert_eq!(marked(&steps, none, at(-2.5)), 40, "on the other side of the vehicle");
     }
 
     #[test]
