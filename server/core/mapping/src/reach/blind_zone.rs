@@ -3,7 +3,7 @@
 //! In: the cells beside a step of the ground, the obstacles, and which polar cells have ground that was seen. Out: on
 //! each side of the vehicle the cells on the straight line between the nearest cell beside a step ahead and that
 //! behind. A kerb or a ditch along the road is seen ahead and behind, but no return shows the piece between. The line
-//! counts only if no ground was seen on the vehicle's side of it: the vehicle would stand beyond the edge otherwise.
+//! counts only if no ground was seen on the vehicle's side of it: what was seen there decides by itself.
 
 use std::f32::consts::TAU;
 
