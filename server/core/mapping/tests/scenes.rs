@@ -9,6 +9,7 @@
 
 mod common;
 
+use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, HeightDifferenceConfig};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
@@ -32,7 +33,10 @@ struct SimulatedScan {
 }
 
 fn simulate(scene: Scene) -> SimulatedScan {
-    let config = ScannerConfig::default();
+    simulate_with(ScannerConfig::default(), scene)
+}
+
+fn simulate_with(config: ScannerConfig, scene: Scene) -> SimulatedScan {
     let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
     let simulated = SimulatedVehicle::new(scene, config).true_revolution(1);
     let mut sweep = Sweep::default();
@@ -251,6 +255,23 @@ fn the_thesis_whole_comes_near_its_table_in_the_simulated_scenes() {
             assert!((found.share - paper_share / 100.0).abs() < 0.15, "{name}: {found:?}");
             // Other than with our seeds and gaps, ground shows through the holes of a fence.
             assert!(found.recall <= own.recall && found.precision > 0.97, "{name}: {found:?}");
+        }
+    }
+}
+
+#[test]
+fn a_raised_bed_whose_edge_lies_in_the_blind_zone_is_not_reached() {
+    // The first ring of a VLP-16 meets the ground 7 m away; the kerbs are 4 m away on both sides.
+    let across = Profile::through(&[(-4.0, 0.5), (-4.0, 0.0), (4.0, 0.0), (4.0, 0.5)]);
+    for (across, expected) in [(across, false), (Profile::default(), true)] {
+        let world = Arc::new(World::on(Ground { across, reflectivity: 15, ..Ground::default() }));
+        let config = ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() };
+        let scan = simulate_with(config, Scene { world, ..scenes::flat() });
+        let shared = shared(&scan.sweep);
+        let context = shared.context();
+        assert!(context.is_reached(10.0, 0.0) && context.is_reached(-10.0, 0.0), "the road");
+        for (x, y) in [(0.0, 8.0), (0.0, -8.0), (4.0, 9.0), (-4.0, -9.0)] {
+            assert_eq!(context.is_reached(x, y), expected, "({x}, {y})");
         }
     }
 }

@@ -19,9 +19,9 @@ const TOLERANCES: [[f32; 3]; 6] = [
     [0.17, 0.20, 0.0],
     [0.14, 0.16, 0.0],
 ];
-/// Least number of cells that define the plane. Ours: half of those that a VLP-16 fills; the returns of sensors in the
+/// Least number of cells that define the plane. Ours: one ring of a VLP-16 fills as many; the returns of sensors in the
 /// bumper, which see objects and no ground so near, fill a hundred.
-const CELLS_MIN: usize = 300;
+const CELLS_MIN: usize = 180;
 /// Steepest plane. Ours: no vehicle stands on a steeper one.
 const SLOPE_MAX: f32 = 0.3;
 /// Least number of directions, of 12, in which the cells lie. Ours: ground on one side does not define the plane.

@@ -80,7 +80,7 @@ impl Joins {
 }
 
 /// Calls `mark` with each cell on the straight line between two cells.
-fn draw(from: usize, to: usize, mark: &mut impl FnMut(usize, usize)) {
+pub fn draw(from: usize, to: usize, mark: &mut impl FnMut(usize, usize)) {
     let [[ax, ay], [bx, by]] = [from, to].map(|cell| [(cell % SIDE) as isize, (cell / SIDE) as isize]);
     let steps = (bx - ax).abs().max((by - ay).abs());
     for step in 1..steps {

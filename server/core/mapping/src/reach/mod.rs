@@ -11,10 +11,12 @@
 //! | points -> cells with an obstacle | `obstacles` |
 //! | points -> cells beside a step of the ground | `steps` |
 //! | cells beside a step -> those between two of them | `joins` |
+//! | cells beside a step ahead and behind -> those between them, beside the vehicle | `blind_zone` |
 //! | obstacles -> the ground that they hide | `shadow` |
 //! | open and closed cells -> reached cells | `flood` |
 //! | reached cells -> those without a detour over farther ground | `directions` |
 
+mod blind_zone;
 mod cells;
 pub mod config;
 mod directions;
@@ -29,6 +31,7 @@ use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
 use crate::ground::surface::Confidence;
 use crate::sensor::sweep::Sweep;
 
+use blind_zone::BlindZone;
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
 use directions::Directions;
@@ -90,6 +93,7 @@ pub struct Reach {
     open: Bits,
     closed: Bits,
     joins: Joins,
+    blind_zone: BlindZone,
     /// Closed cells, and those between two cells beside a step.
     barred: Bits,
     directions: Directions,
@@ -115,6 +119,7 @@ impl Reach {
             open: bits.clone(),
             closed: bits.clone(),
             joins: Joins::new(),
+            blind_zone: BlindZone::new(config.vehicle_width_m),
             barred: bits,
             directions: Directions::new(),
             flood: Flood::new(SIDE),
@@ -138,6 +143,8 @@ impl Reach {
         self.barred.copy_from(closed);
         let barred = &mut self.barred;
         self.joins.find(closed, &self.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
+        let obstacle_m = |cell| self.obstacles.height_m(cell);
+        self.blind_zone.find(closed, obstacle_m, ground.confidences(), |ix, iy| barred.set(ix, iy));
         for (cell, _) in self.obstacles.cells() {
             closed.set(cell % SIDE, cell / SIDE);
             barred.set(cell % SIDE, cell / SIDE);

@@ -47,6 +47,11 @@ impl Obstacles {
         }
     }
 
+    /// Height that the returns of a cell's obstacle span, metres; negative without an obstacle.
+    pub fn height_m(&self, cell: usize) -> f32 {
+        self.spans_m[cell][1] - self.spans_m[cell][0]
+    }
+
     /// The cells with an obstacle, and the heights over the ground that it spans, metres.
     pub fn cells(&self) -> impl Iterator<Item = (usize, [f32; 2])> {
         self.found.iter().map(|cell| (*cell as usize, self.spans_m[*cell as usize]))

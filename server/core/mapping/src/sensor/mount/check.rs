@@ -124,7 +124,9 @@ impl MountCheck {
         let step = (sweep.x.len() / POINTS) | 1;
         for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z).step_by(step) {
             if x.abs() < AHEAD_M && y.abs() < BESIDE_M && z.abs() < Z_M {
-                let cell = ((x + AHEAD_M) / CELL_M) as usize * CELLS_BESIDE + ((y + BESIDE_M) / CELL_M) as usize;
+                // The sum of a value just below the limit may be rounded to the limit.
+                let row = (((x + AHEAD_M) / CELL_M) as usize).min(CELLS_AHEAD - 1);
+                let cell = row * CELLS_BESIDE + (((y + BESIDE_M) / CELL_M) as usize).min(CELLS_BESIDE - 1);
                 self.cells[cell] = self.cells[cell].min(z);
             }
         }
@@ -243,6 +245,20 @@ mod tests {
                 "all cells of the ground and no others"
             );
         }
+    }
+
+    #[test]
+    fn a_return_just_within_the_last_cell_is_in_it() {
+        let mut check = MountCheck::default();
+        let corner = Sweep {
+            x: vec![AHEAD_M.next_down(), -AHEAD_M.next_down()],
+            y: vec![BESIDE_M.next_down(), -BESIDE_M.next_down()],
+            z: vec![0.0; 2],
+            ..Sweep::default()
+        };
+        check.push(&corner, [0.0; 3]);
+        let seen: Vec<usize> = (0..check.cells.len()).filter(|cell| check.cells[*cell].is_finite()).collect();
+        assert_eq!(seen, [0, CELLS_AHEAD * CELLS_BESIDE - 1]);
     }
 
     #[test]
