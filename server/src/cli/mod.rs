@@ -157,7 +157,7 @@ fn run(command: Command) -> Result<Exit> {
         Command::Vehicles(options) => vehicles::run(&options)?,
         Command::Status(options) => return status::run(&options),
         Command::Top(options) => top::run(&options)?,
-        Command::Recorder(options) => recorder::run(options)?,
+        Command::Recorder(options) => return recorder::run(options),
         Command::Export(options) => return export::run(&options),
         Command::Info(options) => return info::run(&options),
         Command::Repair(options) => return repair::run(&options),

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::time::{Duration, UNIX_EPOCH};
 
 use serde_json::{Value, json};
 
@@ -40,9 +41,13 @@ impl fmt::Display for Damage {
             write!(f, "; lost: {}", lost.collect::<Vec<_>>().join(", "))?;
         }
         if let Some((first, last)) = self.log_ns {
-            let seconds = |ns: u64| ns as f64 * 1e-9;
-            write!(f, "; lost from {:.3} s to {:.3} s", seconds(first), seconds(last))?;
+            write!(f, "; lost from {} to {}", utc(first), utc(last))?;
         }
         Ok(())
     }
+}
+
+/// A time in ns since the Unix epoch for people: RFC 3339 in UTC, to the millisecond.
+pub fn utc(ns: u64) -> String {
+    humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_nanos(ns)).to_string()
 }

@@ -32,14 +32,15 @@ pub(super) async fn watch(config: Config, vehicles: Vehicles, control: RecorderC
 struct Observed {
     /// True if its newest map is stale.
     is_stale: bool,
-    /// Of each sensor, whether its data arrive and are in the newest map.
-    in_maps: Vec<bool>,
+    /// Each sensor by its name, and whether its data arrive and are in the newest map.
+    in_maps: Vec<(String, bool)>,
 }
 
 fn observe(config: &Config, vehicles: &Vehicles) -> Vec<Observed> {
     let of_vehicle = |(vehicle, status): (&crate::config::Vehicle, std::sync::Arc<crate::status::VehicleStatus>)| {
         let is_stale = status.assess().map_age_ms.is_some_and(|age_ms| age_ms > f64::from(vehicle.maps.valid_ms));
-        Observed { is_stale, in_maps: status.sensors_in_maps() }
+        let names = vehicle.sensors.iter().map(|sensor| sensor.name.clone());
+        Observed { is_stale, in_maps: names.zip(status.sensors_in_maps()).collect() }
     };
     config.vehicles.iter().zip(vehicles.statuses()).map(of_vehicle).collect()
 }
@@ -54,14 +55,13 @@ struct Conditions {
 }
 
 impl Conditions {
-    /// Takes what is seen of the vehicles; returns the reason of a condition that has begun. Names of sensors may have
-    /// characters that names of folders must not have, so a reason has the sensor's number.
+    /// Takes what is seen of the vehicles; returns the reason of a condition that has begun.
     fn update(&mut self, rules: &[SaveRule], observed: &[Observed]) -> Option<String> {
         let mut begun = None;
         for (vehicle, Observed { is_stale, in_maps }) in observed.iter().enumerate() {
             let stale = rules.contains(&SaveRule::MapStale).then(|| ("map-stale".to_owned(), *is_stale));
-            let sensors = in_maps.iter().enumerate().filter(|_| rules.contains(&SaveRule::SensorLost));
-            let lost = sensors.map(|(index, is_in_map)| (format!("sensor-{index}-lost"), !is_in_map));
+            let sensors = in_maps.iter().filter(|_| rules.contains(&SaveRule::SensorLost));
+            let lost = sensors.map(|(sensor, is_in_map)| (format!("{}-lost", as_reason(sensor)), !is_in_map));
             for (reason, holds) in stale.into_iter().chain(lost) {
                 let condition = (vehicle, reason.clone());
                 if !holds {
@@ -76,6 +76,12 @@ impl Conditions {
     }
 }
 
+/// A sensor's name with the characters and the length that a reason of a save may have.
+fn as_reason(sensor: &str) -> String {
+    const LENGTH_MAX: usize = 30;
+    sensor.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).take(LENGTH_MAX).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -85,17 +91,22 @@ mod tests {
         let rules = [SaveRule::MapStale, SaveRule::SensorLost];
         let mut conditions = Conditions::default();
         let mut update = |seen: [(bool, &[bool]); 2]| {
-            conditions.update(&rules, &seen.map(|(is_stale, in_maps)| Observed { is_stale, in_maps: in_maps.to_vec() }))
+            let named = |in_maps: &[bool]| ["front left", "rear"].map(String::from).into_iter().zip(in_maps.to_vec());
+            let observed = |(is_stale, in_maps)| Observed { is_stale, in_maps: named(in_maps).collect() };
+            conditions.update(&rules, &seen.map(observed))
         };
         // The second sensor of the first vehicle starts late; the second vehicle has none.
         assert_eq!(update([(true, &[]), (false, &[])]), None);
         assert_eq!(update([(false, &[true, false]), (false, &[])]), None);
         assert_eq!(update([(false, &[true, true]), (false, &[true])]), None);
-        assert_eq!(update([(false, &[true, false]), (false, &[true])]).as_deref(), Some("sensor-1-lost"));
+        assert_eq!(update([(false, &[true, false]), (false, &[true])]).as_deref(), Some("rear-lost"));
         assert_eq!(update([(false, &[true, false]), (false, &[true])]), None, "it has begun before");
-        assert_eq!(update([(false, &[true, false]), (false, &[false])]).as_deref(), Some("sensor-0-lost"));
+        assert_eq!(update([(false, &[true, false]), (false, &[false])]).as_deref(), Some("front-left-lost"));
         assert_eq!(update([(true, &[true, true]), (false, &[true])]).as_deref(), Some("map-stale"));
-        assert_eq!(update([(false, &[true, false]), (false, &[true])]).as_deref(), Some("sensor-1-lost"), "again");
-        assert_eq!(Conditions::default().update(&[], &[Observed { is_stale: true, in_maps: vec![false] }]), None);
+        assert_eq!(update([(false, &[true, false]), (false, &[true])]).as_deref(), Some("rear-lost"), "again");
+        assert_eq!(
+            Conditions::default().update(&[], &[Observed { is_stale: true, in_maps: vec![("rear".into(), false)] }]),
+            None
+        );
     }
 }

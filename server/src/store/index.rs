@@ -62,6 +62,8 @@ pub struct Search {
 pub struct Found {
     /// The entries, ordered by vehicle and time.
     pub entries: Vec<Entry>,
+    /// Number of parts that fit but for the place, because where the vehicle was is not known.
+    pub without_place: u64,
     /// Names of objects of the index that are no entries, each with the reason.
     pub unreadable: BTreeMap<String, String>,
 }
@@ -177,7 +179,10 @@ pub async fn search(store: &dyn ObjectStore, search: &Search) -> object_store::R
         let bytes = store.get(&key).await?.bytes().await?;
         match serde_json::from_slice::<Entry>(&bytes) {
             Ok(entry) if entry.fits(search) => found.entries.push(entry),
-            Ok(_) => {}
+            Ok(entry) => {
+                let elsewhere = Search { near: None, ..search.clone() };
+                found.without_place += u64::from(entry.cells.is_empty() && entry.fits(&elsewhere));
+            }
             Err(error) => _ = found.unreadable.insert(key.to_string(), error.to_string()),
         }
     }

@@ -66,7 +66,7 @@ pub enum UploadError {
         file: PathBuf,
     },
     /// The store refused the part or did not answer.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {}", file.display(), reason(source))]
     Store {
         /// The part.
         file: PathBuf,
@@ -88,6 +88,18 @@ pub enum UploadError {
         /// CRC-32 of the object.
         found: u32,
     },
+}
+
+/// The reason of a store in one line: of the document in which S3 states an error, its code and message.
+fn reason(error: &object_store::Error) -> String {
+    let text = error.to_string();
+    let Some((before, document)) = text.split_once("<?xml").or_else(|| text.split_once("<Error>")) else { return text };
+    let of = |tag: &str| {
+        let (_, rest) = document.split_once(&format!("<{tag}>"))?;
+        rest.split_once(&format!("</{tag}>")).map(|(text, _)| text)
+    };
+    let stated: Vec<&str> = ["Code", "Message"].into_iter().filter_map(of).collect();
+    format!("{} {}", before.trim_end(), stated.join(": ")).trim_end().to_owned()
 }
 
 /// Sends a finished part to the store, confirms it there, and writes its confirmation beside it. Sending a part again
@@ -248,4 +260,21 @@ fn write_durably(file: &Path, confirmation: &Confirmation) -> io::Result<()> {
     fs::rename(partial, file)?;
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     File::open(folder)?.sync_all()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_error_of_a_bucket_is_one_line_with_its_code_and_message() {
+        let document = "<?xml version=\"1.0\"?><Error><Code>NoSuchBucket</Code><Message>The specified bucket does not \
+                        exist</Message><BucketName>b</BucketName><RequestId>x</RequestId></Error>";
+        let error = |text: String| object_store::Error::Generic { store: "S3", source: text.into() };
+        let stated = reason(&error(format!("Server returned non-2xx status code: 404 Not Found: {document}")));
+        let ending = "404 Not Found: NoSuchBucket: The specified bucket does not exist";
+        assert!(stated.ends_with(ending) && !stated.contains('<'), "{stated}");
+        let plain = reason(&error("connection refused".into()));
+        assert!(plain.ends_with("connection refused"), "{plain}");
+    }
 }

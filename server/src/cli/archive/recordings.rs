@@ -7,6 +7,7 @@ use toml::value::{Datetime, Offset};
 
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line};
+use crate::record::damage::utc;
 use crate::store::index::{Entry, Found, Search, search};
 use crate::store::location;
 
@@ -56,7 +57,7 @@ pub fn run(options: &Options) -> Result<Exit> {
         with_faults: options.faults,
     };
     let store = location::open_existing(&options.store)?;
-    let Found { entries, unreadable } = block_on(async { Ok(search(&*store, &wanted).await?) })?;
+    let Found { entries, without_place, unreadable } = block_on(async { Ok(search(&*store, &wanted).await?) })?;
     if options.json {
         print_line(&format!("{:#}", json!(entries)))?;
     } else {
@@ -64,6 +65,10 @@ pub fn run(options: &Options) -> Result<Exit> {
             print_line(&line(entry))?;
         }
         print_line(&format!("{} found", counted(entries.len() as u64, "part")))?;
+    }
+    if without_place > 0 {
+        let parts = counted(without_place, "part");
+        eprintln!("clearway: {parts} left out that may be near: where the vehicle was is not known, for lack of poses");
     }
     for (name, reason) in &unreadable {
         eprintln!("clearway: {name} is no entry of the index: {reason}");
@@ -73,14 +78,13 @@ pub fn run(options: &Options) -> Result<Exit> {
 
 fn line(entry: &Entry) -> String {
     let list = |names: &std::collections::BTreeSet<String>| names.iter().cloned().collect::<Vec<_>>().join(", ");
-    let seconds = |ns: u64| ns as f64 * 1e-9;
     let faults = if entry.faults.is_empty() { String::new() } else { format!("; FAULTS: {}", list(&entry.faults)) };
     format!(
-        "{}: {}, {:.3} s to {:.3} s, {}, sensors {}{faults}",
+        "{}: {}, {} to {}, {}, sensors {}{faults}",
         entry.part,
         entry.vehicle,
-        seconds(entry.from_ns),
-        seconds(entry.to_ns),
+        utc(entry.from_ns),
+        utc(entry.to_ns),
         counted(entry.bytes, "byte"),
         list(&entry.sensors)
     )

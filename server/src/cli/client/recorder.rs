@@ -6,15 +6,20 @@ use clearway_proto::v1;
 use serde_json::json;
 
 use crate::cli::client::connection::ServerOptions;
-use crate::cli::shared::output::{block_on, print_line};
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::{block_on, counted, print_line};
 use crate::status::recorder_json;
 
 /// Control the recorder of a running server: start, stop, split, save the last seconds, list, status.
 #[derive(Args)]
-#[command(after_help = "Examples:
+#[command(
+    after_help = "Exit codes: 0 good, 2 the server does not answer or refuses, 3 wrong use, 4 the recorder has failed.
+
+Examples:
   clearway recorder status
   clearway recorder save --seconds 60 --reason near-miss
-  clearway recorder list --json")]
+  clearway recorder list --json"
+)]
 pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
@@ -52,11 +57,11 @@ enum Request {
 ///
 /// # Errors
 /// If the server cannot be reached or refuses the request.
-pub fn run(options: Options) -> Result<()> {
+pub fn run(options: Options) -> Result<Exit> {
     block_on(send(options))
 }
 
-async fn send(Options { server, json, request }: Options) -> Result<()> {
+async fn send(Options { server, json, request }: Options) -> Result<Exit> {
     let mut recorder = server.connect().await?.recorder().await?;
     let refused = |status: tonic::Status| Error::msg(status.message().to_owned());
     let answer = match request {
@@ -67,20 +72,27 @@ async fn send(Options { server, json, request }: Options) -> Result<()> {
         Request::Status => recorder.status(v1::RecordingStatusRequest {}).await,
         Request::List => {
             let parts = recorder.list(v1::ListRecordingsRequest {}).await.map_err(refused)?.into_inner().parts;
-            return print_parts(&parts, json);
+            print_parts(&parts, json)?;
+            return Ok(Exit::Good);
         }
     };
     let v1::RecordingResponse { status, files } = answer.map_err(refused)?.into_inner();
     let status = status.unwrap_or_default();
+    let exit = if status.state == "failed" { Exit::Stale } else { Exit::Good };
     if json {
         let mut document = recorder_json(&status);
         document["saved"] = files.into();
         print_line(&format!("{document:#}"))?;
-        return Ok(());
+        return Ok(exit);
     }
     let reason = if status.reason.is_empty() { String::new() } else { format!(": {}", status.reason) };
     let file = if status.file.is_empty() { String::new() } else { format!(" {}", status.file) };
     print_line(&format!("{}{file}, part {}{reason}", status.state, status.part))?;
+    if status.store_waiting > 0 {
+        let (parts, problem) = (counted(status.store_waiting, "part"), &status.store_problem);
+        let why = if problem.is_empty() { String::new() } else { format!(": {problem}") };
+        print_line(&format!("  {parts} for the store{why}"))?;
+    }
     for (vehicle, events) in &status.durable_events {
         print_line(&format!("  {vehicle}: events below {events} are on the disk"))?;
     }
@@ -91,7 +103,7 @@ async fn send(Options { server, json, request }: Options) -> Result<()> {
     for file in files {
         print_line(&format!("  saved {file}"))?;
     }
-    Ok(())
+    Ok(exit)
 }
 
 fn print_parts(parts: &[v1::RecordedPart], json: bool) -> Result<()> {

@@ -16,7 +16,7 @@ pub enum Exit {
     /// The command line is wrong, whatever the files are. A value that does not fit the files is
     /// [`Exit::Unreadable`].
     WrongUse = 3,
-    /// The newest map is stale, or none has come; the state of a vehicle is "error".
+    /// The newest map is stale, or none has come; the state of a vehicle is "error"; the recorder has failed.
     Stale = 4,
     /// The state of a vehicle is "warn", and of none "error".
     Warn = 5,
@@ -25,8 +25,8 @@ pub enum Exit {
 /// The exit codes, as the help text lists them.
 pub const EXIT_CODES: &str = "Exit codes: 0 good, 1 the result differs, 2 an input cannot be read or is not whole, or \
     the command failed (a value that does not fit the files too), 3 wrong use, \
-    4 the map is stale (get, watch) or a vehicle's state is error (status), 5 it is \
-    warn (status).";
+    4 the map is stale (get, watch), a vehicle's state is error (status) or the recorder has failed (recorder), 5 the \
+    state is warn (status).";
 
 impl Exit {
     /// [`Exit::Stale`] if the newest map is stale.

@@ -37,6 +37,9 @@ pub struct Options {
     /// The car's sensors.
     #[arg(long, value_enum, default_value_t, visible_alias = "sensor")]
     sensors: Sensors,
+    /// Listen on ports that the operating system chooses. Without it a port that is in use is replaced by such a one.
+    #[arg(long)]
+    any_port: bool,
     /// Print one JSON object a second, and a summary.
     #[arg(long)]
     json: bool,
@@ -56,7 +59,7 @@ pub fn run(options: Options) -> Result<()> {
 }
 
 async fn demo_and_print(options: Options) -> Result<()> {
-    let Options { seconds: duration, record, force, record_mb, sensors, json } = options;
+    let Options { seconds: duration, record, force, record_mb, sensors, any_port, json } = options;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let picture = record.as_ref().map_or_else(|| folder.join("demo.png"), |record| record.with_extension("png"));
     let options = DemoOptions {
@@ -66,7 +69,7 @@ async fn demo_and_print(options: Options) -> Result<()> {
         record_mb,
         picture: Some(picture.clone()),
         sensors,
-        any_port: false,
+        any_port,
     };
     let begun = |endpoints: &Endpoints| {
         if !json {
