@@ -73,8 +73,8 @@ pub fn a_drive_is_shown_in_3d() {
 fn open(browser: &Browser) {
     let script = "const button = document.getElementById('space-button');
         if (button.getAttribute('aria-pressed') === 'false') button.click();
-        return document.getElementById('space-text').textContent.includes('planes of drivability')";
-    browser.until("in the planes of drivability's segments", script);
+        return document.getElementById('space-text').textContent.includes('terrain\\'s planes')";
+    browser.until("in terrain's planes", script);
 }
 
 /// The browser takes WebGL away, as it does when the process of the graphics card ends, and gives it back.
@@ -85,7 +85,7 @@ fn webgl_comes_back(browser: &Browser) {
     );
     until_text(browser, "waiting for the browser to give WebGL back");
     browser.run("window.lost.restoreContext()");
-    until_text(browser, "in the planes of drivability's segments");
+    until_text(browser, "in terrain's planes");
     colours_are_drawn(browser);
 }
 

@@ -100,7 +100,7 @@ async fn a_browser_on_a_slow_link_gets_the_newest_map_and_never_a_backlog() {
     link.allowed.add_permits(1 << 20);
     let on_the_way = [browser.map().await, browser.map().await];
     assert!(on_the_way.iter().all(|(sequence, _)| *sequence < 4), "{on_the_way:?} of {made}");
-    browser.say(r#"{"type":"watch","vehicle":"nobody","id":2}"#).await;
+    browser.say(r#"{"type":"watch","vehicle":"absent","id":2}"#).await;
     let refused = browser.text_of("refused").await;
     assert_eq!(refused["id"], 2, "no map came before the answer: {refused}");
 
@@ -156,7 +156,7 @@ async fn hundreds_of_browsers_get_every_map_and_one_too_many_is_refused_in_words
     let refused = get(address, "/").await;
     assert!(refused.starts_with("HTTP/1.1 503") && refused.contains("which page.connections_max allows"), "{refused}");
     // The others stay, and so does gRPC.
-    browsers[0].say(r#"{"type":"watch","vehicle":"nobody","id":2}"#).await;
+    browsers[0].say(r#"{"type":"watch","vehicle":"absent","id":2}"#).await;
     browsers[0].text_of("refused").await;
     let vehicles = grpc(&running).await.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap().into_inner();
     assert_eq!(vehicles.vehicles[0].name, "car");
