@@ -124,7 +124,7 @@ async fn the_last_seconds_are_saved_when_one_of_two_sensors_is_lost() {
     top.halt();
     within("shutdown", running.shutdown()).await.unwrap();
     let [save] = &saves(folder.path())[..] else { panic!("{:?}", saves(folder.path())) };
-    assert!(save.ends_with("sensor-1-lost"), "{save}");
+    assert!(save.ends_with("rear-lost"), "{save}");
     for file in std::fs::read_dir(folder.path().join("saved").join(save)).unwrap() {
         let report = verify(&file.unwrap().path()).unwrap();
         assert!(report.is_good() && report.is_closed, "{report:?}");

@@ -196,6 +196,22 @@ fn a_repaired_recording_is_whole_and_has_all_that_can_be_read() {
 }
 
 #[test]
+fn a_file_damaged_outside_of_its_chunks_is_repaired_without_a_loss() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut bytes = in_chunks();
+    // Within the offsets of the messages, which nothing reads but the check of the section.
+    let index = records(&bytes, op::MESSAGE_INDEX)[2];
+    bytes[index + 20..index + 24].fill(0xff);
+    std::fs::write(folder.path().join("damaged.mcap"), &bytes).unwrap();
+    let output = run(folder.path(), "clearway", &["repair", "damaged.mcap", "repaired.mcap", "--json"]);
+    let said = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(0), "{said}{}", text(&output.stderr));
+    assert!(said.contains("\"lost_messages\": 0") && said.contains("outside of its chunks"), "{said}");
+    let count = |file: &Path| McapReader::open(file).unwrap().count();
+    assert_eq!(count(&folder.path().join("repaired.mcap")), count(&golden()));
+}
+
+#[test]
 fn an_unreadable_file_never_ends_with_success() {
     let folder = tempfile::tempdir().unwrap();
     let bytes = std::fs::read(golden()).unwrap();

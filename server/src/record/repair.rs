@@ -18,6 +18,9 @@ use crate::base::file_advice::advised;
 pub struct Report {
     /// Number of messages of the new file.
     pub messages: u64,
+    /// Number of messages that the damaged file should have and the new one lacks; `None` if the damaged file does not
+    /// say how many it should have.
+    pub lost_messages: Option<u64>,
     /// The damaged parts of the file.
     pub damages: Vec<Damage>,
     /// How the file is incomplete; `None` if it is whole.
@@ -28,7 +31,7 @@ impl Report {
     /// The report as one JSON object.
     pub fn to_json(&self) -> Value {
         json!({
-            "messages": self.messages, "incomplete": self.incomplete,
+            "messages": self.messages, "lost_messages": self.lost_messages, "incomplete": self.incomplete,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
         })
     }
@@ -112,7 +115,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
         .create(BufWriter::new(file))
         .map_err(failed)?;
     let mut report = Report::default();
-    let mut damages = 0;
+    let (mut damages, mut stated) = (0, None);
     // Ids of the damaged file -> ids of the new one.
     let (mut schemas, mut channels) = (BTreeMap::from([(0, 0)]), BTreeMap::new());
     while let Some(record) = reader.next_record()? {
@@ -144,10 +147,15 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
                 let AttachmentHeader { log_time, create_time, name, media_type } = header;
                 writer.attach(&Attachment { log_time, create_time, name, media_type, data })
             }
+            Record::Statistics(of) => {
+                stated = Some(of.message_count);
+                Ok(())
+            }
             _ => Ok(()),
         };
         copied.map_err(failed)?;
     }
+    report.lost_messages = stated.map(|stated: u64| stated.saturating_sub(report.messages));
     (report.damages, report.incomplete) = (reader.damages(), reader.incomplete());
     if report.messages == 0 {
         return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });

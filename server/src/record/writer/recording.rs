@@ -372,8 +372,9 @@ impl<F: Files> RecordingWriter<F> {
     }
 
     fn begin_or_fail(&mut self, now: Instant) {
+        let number = self.newest_part + 1;
         if let Err(error) = self.begin_part(now) {
-            self.fail(&error.to_string(), now);
+            self.fail(&format!("part {number} cannot be begun: {error}"), now);
         }
     }
 
