@@ -23,7 +23,8 @@ def test_a_replay_is_paused_stepped_and_sought(clearway_replay):
         assert (sought.phase, round(sought.position_s, 6)) == ("paused", 0.3)
         at = next(m for m in maps if m.sequence == sought.maps["car"] - 1)
         assert drive.step().maps["car"] == at.sequence + 2
-        assert next(maps).sequence == at.sequence + 1
+        # The map of the place may come twice: as a step has made it, and as the seek has sent it again.
+        assert next(m for m in maps if m.sequence > at.sequence).sequence == at.sequence + 1
         assert (drive.speed(2.0).speed, drive.speed(math.inf).speed) == (2.0, math.inf)
         assert drive.lockstep().lockstep and not drive.lockstep(False).lockstep
         assert drive.play().phase == "playing"

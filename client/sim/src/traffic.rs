@@ -6,7 +6,7 @@
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 
 use crate::scene::course::{Course, Drive};
 use crate::scene::ground::Ground;
@@ -72,6 +72,23 @@ pub fn six_units() -> [PlaneUnit; 6] {
         let ego_from_sensor = Isometry3::from_parts(Translation3::new(x, y, 0.45), turned);
         PlaneUnit { ego_from_sensor, seed, ..PlaneUnit::default() }
     })
+}
+
+/// The scans of the six units in the first 100 ms of a [`street`], 52,800 rays with and without a return (Seo 2014): of
+/// each the returns, x, y and z, and the position of its unit, ego frame, metres. Six scans, one of each unit, follow
+/// six.
+pub fn scans_of_six_units() -> Vec<([Vec<f32>; 3], [f32; 3])> {
+    let (scene, units) = (street(0.0), six_units());
+    let in_ego_frame = |unit: &PlaneUnit, number| {
+        let scan = unit.scan(&scene, number);
+        let mut returns: [Vec<f32>; 3] = Default::default();
+        for ((x, y), z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
+            let point = (unit.ego_from_sensor * Point3::new(*x, *y, *z).cast::<f64>()).cast::<f32>();
+            returns.iter_mut().zip(point.iter()).for_each(|(axis, value)| axis.push(*value));
+        }
+        (returns, unit.ego_from_sensor.translation.vector.cast::<f32>().into())
+    };
+    (1..=5).flat_map(|number| units.iter().map(move |unit| (unit, number))).map(|(u, n)| in_ego_frame(u, n)).collect()
 }
 
 /// The objects on the ground at one time.

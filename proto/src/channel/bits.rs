@@ -61,18 +61,24 @@ impl BitWriter {
         self.bytes
     }
 
+    #[inline]
     fn write_golomb(&mut self, number: u64, order: u32) {
         let number = number + (1 << order);
-        let bits = number.ilog2() + 1;
+        let bits = u64::BITS - number.leading_zeros();
         let zeros = bits - 1 - order;
         if zeros + bits <= 32 {
             // Zeros before a number do not change its value.
             self.write_bits(number, zeros + bits);
         } else {
-            self.write_bits(0, zeros);
-            self.write_bits(number >> 16, bits - 16);
-            self.write_bits(number & 0xffff, 16);
+            self.write_long(number, bits, zeros);
         }
+    }
+
+    #[cold]
+    fn write_long(&mut self, number: u64, bits: u32, zeros: u32) {
+        self.write_bits(0, zeros);
+        self.write_bits(number >> 16, bits - 16);
+        self.write_bits(number & 0xffff, 16);
     }
 
     /// Writes up to 32 bits.

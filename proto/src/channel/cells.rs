@@ -109,10 +109,38 @@ pub(crate) trait Cell: Copy + Default + PartialEq {
     fn into_cells(cells: Vec<Self>) -> Cells;
     /// Unwraps cells of this type; `None` for cells of another type.
     fn from_cells(cells: Cells) -> Option<Vec<Self>>;
+    /// Index of the first of eight cells that differs from the other one at its place; 8 if none does.
+    fn first_difference(cells: &[Self; 8], others: &[Self; 8]) -> usize;
+}
+
+/// Length of the common prefix.
+#[inline]
+pub(crate) fn equal_prefix<T: Cell>(cells: &[T], others: &[T]) -> usize {
+    let length = cells.len().min(others.len());
+    let (cells, others) = (&cells[..length], &others[..length]);
+    let mut at = 0;
+    // Most prefixes are short, and most cells lie in long ones: these are compared in blocks, as vectors.
+    if let (Some(here), Some(there)) = (cells.first_chunk::<8>(), others.first_chunk::<8>()) {
+        let first = T::first_difference(here, there);
+        if first < 8 {
+            return first;
+        }
+        const BLOCK: usize = 32;
+        let blocks = cells.as_chunks::<BLOCK>().0.iter().zip(others.as_chunks::<BLOCK>().0);
+        at = BLOCK * blocks.take_while(|(cells, others)| cells == others).count();
+        for (here, there) in cells[at..].as_chunks::<8>().0.iter().zip(others[at..].as_chunks::<8>().0) {
+            let first = T::first_difference(here, there);
+            at += first;
+            if first < 8 {
+                return at;
+            }
+        }
+    }
+    at + cells[at..].iter().zip(&others[at..]).take_while(|(cell, other)| cell == other).count()
 }
 
 macro_rules! cells {
-    ($($cell:ty, $variant:ident, $to_wire:expr, $from_wire:expr;)*) => {$(
+    ($($cell:ty, $variant:ident, $to_wire:expr, $from_wire:expr, $first_difference:expr;)*) => {$(
         impl Cell for $cell {
             const BYTES: usize = size_of::<$cell>();
 
@@ -137,12 +165,26 @@ macro_rules! cells {
             fn from_cells(cells: Cells) -> Option<Vec<Self>> {
                 if let Cells::$variant(cells) = cells { Some(cells) } else { None }
             }
+
+            #[inline(always)]
+            fn first_difference(cells: &[Self; 8], others: &[Self; 8]) -> usize {
+                $first_difference(cells, others)
+            }
         }
     )*};
 }
 
 cells! {
-    u8, U8, u16::from, |wire: u8| wire;
-    i8, I8, |cell: i8| u16::from(((cell << 1) ^ (cell >> 7)) as u8), |wire: u8| (wire >> 1) as i8 ^ -((wire & 1) as i8);
-    u16, U16, |cell| cell, |wire: u16| wire;
+    u8, U8, u16::from, |wire: u8| wire, first_different_byte;
+    i8, I8, |cell: i8| u16::from(((cell << 1) ^ (cell >> 7)) as u8), |wire: u8| (wire >> 1) as i8 ^ -((wire & 1) as i8),
+        |cells: &[i8; 8], others: &[i8; 8]| first_different_byte(&cells.map(|v| v as u8), &others.map(|v| v as u8));
+    u16, U16, |cell| cell, |wire: u16| wire, |cells: &[u16; 8], others: &[u16; 8]| {
+        let packed = |cells: &[u16; 8]| cells.iter().rev().fold(0_u128, |all, cell| all << 16 | u128::from(*cell));
+        (packed(cells) ^ packed(others)).trailing_zeros() as usize / 16
+    };
+}
+
+#[inline(always)]
+fn first_different_byte(bytes: &[u8; 8], others: &[u8; 8]) -> usize {
+    (u64::from_le_bytes(*bytes) ^ u64::from_le_bytes(*others)).trailing_zeros() as usize / 8
 }

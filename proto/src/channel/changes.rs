@@ -66,11 +66,22 @@ fn mark_changed(contexts: &mut [u8], columns: usize, changed: usize) {
     }
 }
 
-/// Number of unchanged cells of context 0 at the beginning, a multiple of [`CALM`]'s length.
+/// Number of unchanged cells of context 0 at the beginning, or a smaller one if it is large.
 fn calm_cells<T: Cell>(cells: &[T], now: &[T], contexts: &[u8]) -> usize {
-    const STEP: usize = CALM.len();
-    let blocks = cells.as_chunks::<STEP>().0.iter().zip(now.as_chunks::<STEP>().0).zip(contexts.as_chunks::<STEP>().0);
-    STEP * blocks.take_while(|((cells, now), contexts)| **contexts == CALM && cells == now).count()
+    const BLOCK: usize = CALM.len();
+    let of_eight = |((cells, now), contexts): ((&[T; 8], &[T; 8]), &[u8; 8])| {
+        let contexts = u64::from_le_bytes(*contexts).trailing_zeros() as usize / 8;
+        T::first_difference(cells, now).min(contexts)
+    };
+    let (eights, now_eights, of_eights) = (cells.as_chunks::<8>().0, now.as_chunks::<8>().0, contexts.as_chunks().0);
+    // Most such pieces are short, and most cells lie in long ones.
+    match eights.iter().zip(now_eights).zip(of_eights).next().map(of_eight) {
+        Some(8) => {}
+        first => return first.unwrap_or(0),
+    }
+    let blocks = cells.as_chunks::<BLOCK>().0.iter().zip(now.as_chunks::<BLOCK>().0).zip(contexts.as_chunks().0);
+    let calm = blocks.take_while(|((cells, now), contexts)| **contexts == CALM && cells == now).count();
+    (BLOCK * calm).max(8)
 }
 
 /// Encodes `cells` as differences from `base`, which has as many cells, in rows of `columns`.

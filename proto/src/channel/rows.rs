@@ -4,7 +4,7 @@
 //! and runs (cells of one other value). A map consists of patches, so most of a row equals the row before it.
 
 use crate::channel::bits::{BitReader, BitWriter};
-use crate::channel::cells::Cell;
+use crate::channel::cells::{Cell, equal_prefix};
 use crate::channel::error::DecodeError;
 
 /// Encodes cells in rows of `columns`; `None` if the result does not have fewer bytes than `length_max`.
@@ -39,15 +39,6 @@ fn copy_end<T: Cell>(cells: &[T], columns: usize, start: usize) -> usize {
     let zeros = first.iter().skip(start).take_while(|cell| **cell == T::default()).count();
     let at = start + zeros;
     if at < first.len() { at } else { at + equal_prefix(&cells[at..], &cells[at - columns.min(at)..]) }
-}
-
-/// Length of the common prefix.
-fn equal_prefix<T: Cell>(cells: &[T], others: &[T]) -> usize {
-    // Compares 32 cells at once: the compiler makes vector instructions of it.
-    const STEP: usize = 32;
-    let steps = cells.chunks_exact(STEP).zip(others.chunks_exact(STEP)).take_while(|(cells, others)| cells == others);
-    let at = STEP * steps.count();
-    at + cells[at..].iter().zip(&others[at..]).take_while(|(cell, other)| cell == other).count()
 }
 
 /// Decodes `count` cells in rows of `columns`. Refuses a payload that [`encode_rows`] would not write. The lengths are

@@ -22,7 +22,6 @@ use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::sensor::motion::{EgoTrajectory, Motion};
 use clearway_mapping::sensor::ring_series::RingSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
-use clearway_sim::planes::PlaneUnit;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::traffic;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -193,24 +192,10 @@ fn safe_path(bencher: Bencher) {
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &context, &mut layer));
 }
 
-/// Scans of 100 ms from six sensors of four planes each on a vehicle in traffic: 52,800 rays, with and without a
-/// return.
+/// Scans of 100 ms from six sensors on a vehicle in traffic, with the position of each sensor.
 fn six_units() -> Vec<(Sweep, [f32; 3])> {
-    let scene = traffic::street(0.0);
-    let scan = |unit: &PlaneUnit, number| {
-        let scan = unit.scan(&scene, number);
-        let mut sweep = Sweep::default();
-        for i in 0..scan.x.len() {
-            let point = nalgebra::Point3::new(scan.x[i], scan.y[i], scan.z[i]).cast::<f64>();
-            let point = (unit.ego_from_sensor * point).cast::<f32>();
-            sweep.x.push(point.x);
-            sweep.y.push(point.y);
-            sweep.z.push(point.z);
-        }
-        (sweep, unit.ego_from_sensor.translation.vector.cast::<f32>().into())
-    };
-    let units = traffic::six_units();
-    (1..=5).flat_map(|number| units.iter().map(move |unit| (unit, number))).map(|(u, n)| scan(u, n)).collect()
+    let scans = traffic::scans_of_six_units().into_iter();
+    scans.map(|([x, y, z], origin_m)| (Sweep { x, y, z, ..Sweep::default() }, origin_m)).collect()
 }
 
 /// Integrates all scans of 100 ms, and makes the layer.

@@ -10,6 +10,7 @@ use clearway_mapping::event::{Body, Cause, EgoPose, Event, Scan};
 use clearway_mapping::layer::Cells;
 use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::sensor::deviation::STEPS;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -456,12 +457,14 @@ fn the_deviations_of_all_sensors_stay_in_a_merged_sweep() {
     assert!(send(&mut pipeline, 1, 1_000_000_000, 0.16).is_none(), "the reference sensor makes the maps");
     let map = send(&mut pipeline, 0, 1_000_000_001, 0.0).unwrap();
     let sweep = pipeline.newest_sweep();
-    assert_eq!((sweep.x.len(), sweep.deviation.len(), sweep.noise.len()), (18_000, 18_000, 18_000));
-    assert!(sweep.deviation[..9000].iter().all(|deviation| deviation.abs() < 1e-4));
+    assert_eq!((sweep.x.len(), sweep.deviation.len()), (18_000, 18_000));
+    // Deviation and noise of a point, over its range.
+    let shares = |point: usize| sweep.deviation[point].steps().unwrap().map(|steps| steps as f32 / STEPS);
+    assert!((0..9000).all(|point| shares(point)[0].abs() < 1e-4));
     // The range of the rear sensor, not the distance from the ego origin, divides the deviation and the noise.
     let range_m = 5.0_f32.hypot(1.9);
-    assert!((sweep.deviation[9011].abs() * range_m - 0.08).abs() < 0.02, "{}", sweep.deviation[9011]);
-    assert!((sweep.noise[9011] * range_m - 0.03).abs() < 1e-4 && (sweep.noise[11] * range_m - 0.02).abs() < 1e-4);
+    assert!((shares(9011)[0].abs() * range_m - 0.08).abs() < 0.02, "{:?}", shares(9011));
+    assert!((shares(9011)[1] * range_m - 0.03).abs() < 1e-4 && (shares(11)[1] * range_m - 0.02).abs() < 1e-4);
     let terrain = map.layers.iter().find(|layer| layer.name == "terrain").unwrap();
     let channel = terrain.channels.iter().find(|channel| channel.name == "roughness").unwrap();
     let Cells::U8(raw) = &channel.cells else { panic!("roughness is u8") };

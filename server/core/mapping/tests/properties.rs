@@ -13,6 +13,7 @@ use clearway_mapping::layer::height_difference::HeightDifference;
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::terrain::class::TerrainClass;
 use clearway_mapping::layer::{Context, LayerMaker};
+use clearway_mapping::sensor::deviation::Deviation;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use common::*;
 use nalgebra::Isometry3;
@@ -106,8 +107,7 @@ proptest! {
     ) {
         let mut sweep = empty(Model::Hdl64eS2);
         points.iter().for_each(|point| add(&mut sweep, *point));
-        sweep.deviation = deviations[..points.len()].to_vec();
-        sweep.noise = vec![0.001; points.len()];
+        sweep.deviation = deviations[..points.len()].iter().map(|share| Deviation::new(*share, 0.001)).collect();
         let config = TerrainConfig {
             variant, cell_m, range_m_max, points_min, planes, roughness_points_min: 1, ..TerrainConfig::default()
         };

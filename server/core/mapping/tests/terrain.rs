@@ -312,7 +312,7 @@ fn coarse_roughness(sweep: &Sweep) -> Vec<Option<f32>> {
     roughness.clear(200 * 200);
     for index in (0..sweep.x.len()).filter(|index| sweep.z[*index] < 2.5) {
         if let Some(cell) = coarse_cell(sweep.x[index], sweep.y[index]) {
-            roughness.add_points(&[cell as u32], &sweep.deviation[index..=index], &sweep.noise[index..=index]);
+            roughness.add_points(&[cell as u32], &sweep.deviation[index..=index]);
         }
     }
     (0..200 * 200).map(|cell| roughness.of_cell(cell, 4)).collect()
@@ -390,7 +390,7 @@ fn the_roads_of_captures_of_32_and_16_lasers_are_smooth() {
 
 #[test]
 fn a_sweep_without_deviations_has_unknown_roughness() {
-    let sweep = Sweep { deviation: Vec::new(), noise: Vec::new(), ..simulate(scenes::flat()) };
+    let sweep = Sweep { deviation: Vec::new(), ..simulate(scenes::flat()) };
     let layer = terrain(&sweep, &TerrainConfig::default());
     assert!(counts(&layer)[usize::from(FLAT)] > 10_000);
     assert!(values(&layer, "roughness").iter().all(|raw| *raw == i32::from(ROUGHNESS.unknown)));

@@ -53,6 +53,15 @@ const CHUNK: usize = 1024;
 /// Columns of [`Ground::nodes`].
 const WIDTH: usize = COLUMNS + 2;
 
+/// Where points lie on the surface; a buffer.
+struct Places {
+    cells: [u32; CHUNK],
+    /// The node behind each point.
+    nodes: [u32; CHUNK],
+    /// Shares of the way to the next row and to the next column of nodes.
+    shares: [[f32; CHUNK]; 2],
+}
+
 impl Ground {
     /// The ground before the first sweep, around a vehicle with this outline.
     pub fn new(outline: Outline) -> Self {
@@ -109,22 +118,29 @@ impl Ground {
     fn measure_own_points(&mut self, sweep: &Sweep) {
         let mut heights_m = std::mem::take(&mut self.heights_m);
         heights_m.resize(sweep.x.len(), 0.0);
+        let mut places = Places { cells: [0; CHUNK], nodes: [0; CHUNK], shares: [[0.0; CHUNK]; 2] };
         let [rows, turns] = self.cells.point_coordinates();
         let points = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
         let coordinates = rows.chunks(CHUNK).zip(turns.chunks(CHUNK));
         for ((((xs, ys), zs), (rows, turns)), heights_m) in points.zip(coordinates).zip(heights_m.chunks_mut(CHUNK)) {
-            self.measure_chunk([xs, ys, zs], [rows, turns], heights_m);
+            self.measure_chunk([xs, ys, zs], [rows, turns], &mut places, heights_m);
         }
         self.heights_m = heights_m;
     }
 
     /// As [`Self::height_over`] for up to [`CHUNK`] points. What needs no table is computed first and without branches,
     /// so that the compiler vectorises it.
-    fn measure_chunk(&self, [xs, ys, zs]: [&[f32]; 3], [rows, turns]: [&[f32]; 2], heights_m: &mut [f32]) {
+    fn measure_chunk(
+        &self,
+        [xs, ys, zs]: [&[f32]; 3],
+        [rows, turns]: [&[f32]; 2],
+        places: &mut Places,
+        heights_m: &mut [f32],
+    ) {
         let n = xs.len().min(CHUNK);
         let (xs, ys, zs, rows, turns) = (&xs[..n], &ys[..n], &zs[..n], &rows[..n], &turns[..n]);
-        let (mut cells, mut nodes, mut shares) = ([0_u32; CHUNK], [0_u32; CHUNK], [[0.0_f32; CHUNK]; 2]);
-        let [us, vs] = &mut shares;
+        let Places { cells, nodes, shares: [us, vs] } = places;
+        let (cells, nodes, us, vs) = (&mut cells[..n], &mut nodes[..n], &mut us[..n], &mut vs[..n]);
         for i in 0..n {
             cells[i] = floor_to_whole(rows[i]) * COLUMNS as u32 + floor_to_whole(turns[i]);
             let (row, column) = (rows[i] + 0.5, turns[i] + 0.5);

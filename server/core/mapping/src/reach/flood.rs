@@ -4,6 +4,8 @@
 //! the middle of the grid, without a closed cell in it. A row of the grid is a row of bits: dilating the closed cells
 //! by the disc, and the flood fill, process 64 cells at a time.
 
+use std::ops::Range;
+
 /// Flood fill from the middle of a square grid. It reuses its buffers.
 #[derive(Clone, Debug)]
 pub struct Flood {
@@ -86,12 +88,18 @@ impl Bits {
         self.words.fill(0);
     }
 
-    /// Sets the bits of the cells, row by row, for which `is_set` is true, and clears the others.
+    /// Sets the bits of the cells for which `is_set` is true, and clears the others.
+    #[cfg(test)]
     pub fn fill(&mut self, is_set: impl Fn(usize) -> bool) {
+        self.fill_words(|cells| (0..).zip(cells).fold(0, |word, (bit, cell)| word | u64::from(is_set(cell)) << bit));
+    }
+
+    /// Replaces each word by that of `word_of`, which gets the cells of its bits, the lowest first.
+    pub fn fill_words(&mut self, word_of: impl Fn(Range<usize>) -> u64) {
         for (at, word) in self.words.iter_mut().enumerate() {
             let (first, iy) = (at % self.stride * 64, at / self.stride);
-            let bits = (self.width - first).min(64);
-            *word = (0..bits).fold(0, |word, bit| word | u64::from(is_set(iy * self.width + first + bit)) << bit);
+            let from = iy * self.width + first;
+            *word = word_of(from..from + (self.width - first).min(64));
         }
     }
 

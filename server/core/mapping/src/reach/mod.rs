@@ -41,18 +41,23 @@ use obstacles::Obstacles;
 use shadow::Shadow;
 use steps::Steps;
 
+/// Number of cells of a word of bits.
+const WORD: usize = 64;
+/// Number of points that are processed together. Ours: their cells fit into the first-level cache.
+const CHUNK: usize = 1024;
 /// Least height that an obstacle's returns span if it casts a shadow, metres. Ours: kerbs cast none; not tuned.
 const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
 
 /// Whether unseen ground of a polar cell counts as free of obstacles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
 enum View {
-    /// It does.
-    Clear,
-    /// It does where no obstacle casts a shadow on it.
-    BesideObstacle,
     /// It does not.
-    Closed,
+    Closed = 0,
+    /// It does.
+    Clear = 1,
+    /// It does where no obstacle casts a shadow on it.
+    BesideObstacle = 2,
 }
 
 /// Cell of [`Reach`] that contains a position; [`ReachCell::at`] finds it once for a fixed position.
@@ -81,8 +86,6 @@ pub struct Reach {
     polar_of_cell: Vec<PolarIndex>,
     /// Indices of the cells under the vehicle.
     under_vehicle: Vec<usize>,
-    /// By point of the sweep.
-    cell_of_point: Vec<u32>,
     obstacles: Obstacles,
     steps: Steps,
     shadow: Shadow,
@@ -110,7 +113,6 @@ impl Reach {
             config: config.clone(),
             polar_of_cell: centres_m.clone().map(|(_, [x, y])| PolarIndex::at(x, y)).collect(),
             under_vehicle: centres_m.filter(|(_, [x, y])| outline.contains(*x, *y)).map(|(cell, _)| cell).collect(),
-            cell_of_point: Vec::new(),
             obstacles: Obstacles::new(),
             steps: Steps::new(),
             shadow: Shadow::new((0..SIDE * SIDE).map(cells::centre_m)),
@@ -133,13 +135,10 @@ impl Reach {
 
     /// Finds closed cells and reached ground. `ground` is that of `sweep`.
     pub fn update(&mut self, sweep: &Sweep, ground: &Ground) {
+        self.sort_points(sweep, ground.heights_m());
         self.closed.clear();
         let closed = &mut self.closed;
-        cells::find(&sweep.x, &sweep.y, &mut self.cell_of_point);
-        self.obstacles.find(sweep, ground.heights_m(), &self.cell_of_point, &self.config);
-        self.steps.find(sweep, ground.heights_m(), &self.cell_of_point, &self.config, |cell| {
-            closed.set(cell % SIDE, cell / SIDE)
-        });
+        self.steps.find(&self.config, |cell| closed.set(cell % SIDE, cell / SIDE));
         self.barred.copy_from(closed);
         let barred = &mut self.barred;
         self.joins.find(closed, &self.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
@@ -154,6 +153,30 @@ impl Reach {
         let radius = ((self.config.vehicle_width_m / CELL_M - 2.0) / 2.0).max(0.0) as usize;
         self.flood.run(&self.open, &self.barred, radius, self.directions.near());
         self.directions.close(&self.open, &mut self.flood);
+    }
+
+    /// Sorts the points into those of obstacles and those of the ground; the vehicle's own obstacles are left out.
+    fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32]) {
+        self.obstacles.clear();
+        self.steps.clear();
+        let ReachConfig { obstacle_m_min, overhang_m, .. } = self.config;
+        let outline = self.config.outline();
+        let mut cells = [cells::NOWHERE; CHUNK];
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        for (((xs, ys), zs), heights_m) in chunks.zip(heights_m.chunks(CHUNK)) {
+            cells::find(xs, ys, &mut cells);
+            for ((((&cell, &height), &x), &y), &z) in cells.iter().zip(heights_m).zip(xs).zip(ys).zip(zs) {
+                if cell == cells::NOWHERE {
+                    continue;
+                }
+                // NaN fails every comparison.
+                if height < obstacle_m_min {
+                    self.steps.add_point(cell, z, height);
+                } else if height <= overhang_m && !outline.contains(x, y) {
+                    self.obstacles.add_point(cell, height);
+                }
+            }
+        }
     }
 
     /// True if an obstacle stands in a cell, or a step of the ground ends there.
@@ -183,10 +206,18 @@ impl Reach {
         }
         self.classify_polar_cells(confidences);
         let (polar_of_cell, shadow, views) = (&self.polar_of_cell, &self.shadow, &self.views);
-        self.open.fill(|cell| match polar_of_cell[cell].of(views) {
-            Some(View::Clear) => true,
-            Some(View::BesideObstacle) => !shadow.hides(cell),
-            Some(View::Closed) | None => false,
+        self.open.fill_words(|cells| {
+            let mut of_word = [View::Closed as u8; WORD];
+            for (view, polar) in of_word.iter_mut().zip(&polar_of_cell[cells.clone()]) {
+                *view = polar.of(views).map_or(View::Closed as u8, |view| *view as u8);
+            }
+            let [mut clear, mut beside] = [View::Clear, View::BesideObstacle].map(|view| bits_of(view, &of_word));
+            while beside != 0 {
+                let bit = beside.trailing_zeros() as usize;
+                clear |= u64::from(!shadow.hides(cells.start + bit)) << bit;
+                beside &= beside - 1;
+            }
+            clear
         });
         for cell in self.steps.seen().chain(self.under_vehicle.iter().copied()) {
             self.open.set(cell % SIDE, cell / SIDE);
@@ -217,6 +248,17 @@ impl Reach {
         rows.flat_map(|row| [-1, 0, 1].map(|offset| row * COLUMNS + beside(column, offset)))
             .any(|cell| self.has_obstacle[cell])
     }
+}
+
+/// One bit for each cell of a word, set if its view is `view`.
+fn bits_of(view: View, of_word: &[u8; WORD]) -> u64 {
+    let (eights, _) = of_word.as_chunks::<8>();
+    let bit = (view as u8).trailing_zeros();
+    eights.iter().enumerate().fold(0, |word, (byte, views)| {
+        // One bit a byte; the product has them side by side in its highest byte.
+        let bits = u64::from_le_bytes(*views) >> bit & 0x0101_0101_0101_0101;
+        word | bits.wrapping_mul(0x0102_0408_1020_4080) >> 56 << (8 * byte)
+    })
 }
 
 #[cfg(test)]

@@ -1,12 +1,9 @@
 //! Obstacles: returns that are too high over the ground to drive over, and too low to drive under.
 //!
-//! In: the sweep's points and their heights over the ground, metres. Out: the cells with such a return, and the heights
-//! that the returns of each span. Returns of the vehicle itself are left out.
+//! In: cells of returns, and their heights over the ground, metres. Out: the cells with such a return, and the heights
+//! that the returns of each span.
 
-use crate::sensor::sweep::Sweep;
-
-use super::cells::{NOWHERE, SIDE};
-use super::config::ReachConfig;
+use super::cells::SIDE;
 
 /// Span of a cell without an obstacle.
 const EMPTY: [f32; 2] = [f32::INFINITY, f32::NEG_INFINITY];
@@ -26,25 +23,22 @@ impl Obstacles {
         Self { spans_m: vec![EMPTY; SIDE * SIDE], found: Vec::new() }
     }
 
-    /// Replaces the obstacles by those of a sweep. `cells` are the cells of its points.
-    pub fn find(&mut self, sweep: &Sweep, heights_m: &[f32], cells: &[u32], config: &ReachConfig) {
+    /// Removes all obstacles.
+    pub fn clear(&mut self) {
         for cell in self.found.drain(..) {
             self.spans_m[cell as usize] = EMPTY;
         }
-        let outline = config.outline();
-        for (point, (&cell, &height)) in cells.iter().zip(heights_m).enumerate() {
-            if height >= config.obstacle_m_min
-                && height <= config.overhang_m
-                && cell != NOWHERE
-                && !outline.contains(sweep.x[point], sweep.y[point])
-            {
-                let span = &mut self.spans_m[cell as usize];
-                if *span == EMPTY {
-                    self.found.push(cell);
-                }
-                *span = [span[0].min(height), span[1].max(height)];
-            }
+    }
+
+    /// Adds a return from an obstacle, at a height over the ground that is a number, metres.
+    #[inline(always)]
+    pub fn add_point(&mut self, cell: u32, height_m: f32) {
+        let span = &mut self.spans_m[cell as usize];
+        if *span == EMPTY {
+            self.found.push(cell);
         }
+        let [low, high] = *span;
+        *span = [if height_m < low { height_m } else { low }, if height_m > high { height_m } else { high }];
     }
 
     /// Height that the returns of a cell's obstacle span, metres; negative without an obstacle.

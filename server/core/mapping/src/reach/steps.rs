@@ -1,11 +1,9 @@
 //! Steps of the ground itself: kerbs, ledges and the sides of ditches, which the smooth estimate of the ground follows.
 //!
-//! In: the sweep's points and their heights over the ground, metres. Out: the cells on both sides of a step that is too
+//! In: cells and heights of the returns from the ground, metres. Out: the cells on both sides of a step that is too
 //! high and too steep for the vehicle. Two cells at most two cells apart are compared, so that a grade is no step.
 
-use crate::sensor::sweep::Sweep;
-
-use super::cells::{CELL_M, NOWHERE, SIDE};
+use super::cells::{CELL_M, SIDE};
 use super::config::ReachConfig;
 
 /// Lowest height over the ground of a return that is used, metres. Ours: lower ones are mirror images.
@@ -30,16 +28,29 @@ impl Steps {
         Self { spans: vec![EMPTY; SIDE * SIDE], seen: Vec::new() }
     }
 
-    /// Calls `mark` with each cell beside a step. `cells` are the cells of the sweep's points.
-    pub fn find(
-        &mut self,
-        sweep: &Sweep,
-        heights_m: &[f32],
-        cells: &[u32],
-        config: &ReachConfig,
-        mut mark: impl FnMut(usize),
-    ) {
-        self.sort_points(sweep, heights_m, cells, config);
+    /// Removes all returns.
+    pub fn clear(&mut self) {
+        for cell in self.seen.drain(..) {
+            self.spans[cell as usize] = EMPTY;
+        }
+    }
+
+    /// Adds a return from the ground of a cell, at these heights in the ego frame and over the ground, metres.
+    #[inline(always)]
+    pub fn add_point(&mut self, cell: u32, z_m: f32, height_m: f32) {
+        if height_m > LOWEST_M {
+            let span = &mut self.spans[cell as usize];
+            if *span == EMPTY {
+                self.seen.push(cell);
+            }
+            // Ground is within 20 m of the vehicle's height; the cast saturates.
+            let millimetres = (z_m * 1000.0) as i16;
+            *span = [span[0].min(millimetres), span[1].max(millimetres)];
+        }
+    }
+
+    /// Calls `mark` with each cell beside a step.
+    pub fn find(&self, config: &ReachConfig, mut mark: impl FnMut(usize)) {
         let least_mm = (config.step_m_max * 1000.0) as i32;
         let reaches = NEAR.map(|[dx, dy]| {
             let distance_m = CELL_M * ((dx * dx + dy * dy) as f32).sqrt();
@@ -72,23 +83,6 @@ impl Steps {
     pub fn seen(&self) -> impl Iterator<Item = usize> {
         self.seen.iter().map(|cell| *cell as usize)
     }
-
-    fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32], cells: &[u32], config: &ReachConfig) {
-        for cell in self.seen.drain(..) {
-            self.spans[cell as usize] = EMPTY;
-        }
-        for ((&cell, &z), &height) in cells.iter().zip(&sweep.z).zip(heights_m) {
-            if height < config.obstacle_m_min && height > LOWEST_M && cell != NOWHERE {
-                let span = &mut self.spans[cell as usize];
-                if *span == EMPTY {
-                    self.seen.push(cell);
-                }
-                // Ground is within 20 m of the vehicle's height; the cast saturates.
-                let millimetres = (z * 1000.0) as i16;
-                *span = [span[0].min(millimetres), span[1].max(millimetres)];
-            }
-        }
-    }
 }
 
 #[cfg(test)]
@@ -103,15 +97,10 @@ mod tests {
             let apart = [dx, dy].map(|cells| CELL_M * cells as f32);
             let least_m = 0.2_f32.max(0.5 * libm::hypotf(apart[0], apart[1]));
             for (height_m, expected) in [(least_m - 0.002, 0), (least_m + 0.002, 2)] {
-                let sweep = Sweep {
-                    x: vec![5.1, 5.1 + apart[0]],
-                    y: vec![3.1, 3.1 + apart[1]],
-                    z: vec![0.0, height_m],
-                    ..Sweep::default()
-                };
-                let cells: Vec<u32> = sweep.x.iter().zip(&sweep.y).map(|(x, y)| cell(*x, *y)).collect();
-                let mut marked = std::collections::BTreeSet::new();
-                Steps::new().find(&sweep, &[0.0, 0.0], &cells, &config, |cell| marked.extend([cell]));
+                let (mut steps, mut marked) = (Steps::new(), std::collections::BTreeSet::new());
+                steps.add_point(cell(5.1, 3.1), 0.0, 0.0);
+                steps.add_point(cell(5.1 + apart[0], 3.1 + apart[1]), height_m, 0.0);
+                steps.find(&config, |cell| marked.extend([cell]));
                 assert_eq!(marked.len(), expected, "{height_m} m high, {dx} and {dy} cells apart");
             }
         }

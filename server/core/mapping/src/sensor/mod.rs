@@ -7,12 +7,14 @@
 //! | [`motion`] | ego poses, speed + revolution -> how the ego frame moved through it |
 //! | [`self_filter`] | return -> the reason to remove it, if it does not belong to the surroundings |
 //! | [`sweep`] | revolution or scan + mount -> [`sweep::Sweep`] in the ego frame |
+//! | [`deviation`] | deviation of a range -> whole number |
 //! | [`distance_series`] | revolution -> how far each range deviates from its laser's neighbouring ranges |
 //! | [`ring_series`] | scan with rings -> the same for each of its points |
 //! | `no_returns` | revolution -> directions of the rays without a return |
 //! | `rings` | scan -> elevations of the lasers, rings of the points |
 //! | [`mount`] | revolutions -> height, pitch and roll of a sensor; scans -> the ground's deviation from its mount |
 
+pub mod deviation;
 pub mod distance_series;
 pub mod motion;
 pub mod mount;

@@ -172,9 +172,14 @@ fn key(rank: f32, index: u32) -> u64 {
     u64::from(rank.to_bits()) << 32 | u64::from(index)
 }
 
-/// Sorts the points of a ring by azimuth. Most rings come by azimuth, from any azimuth on, with few points out of
-/// order.
+/// Sorts the points of a ring by azimuth. Most rings come by azimuth, rising or falling, from any azimuth on, with few
+/// points out of order.
 fn sort_by_azimuth(of_ring: &mut [u64]) {
+    // A Velodyne turns clockwise.
+    let falling = of_ring.windows(2).filter(|pair| pair[0] > pair[1]).count();
+    if 2 * falling > of_ring.len() {
+        of_ring.reverse();
+    }
     // Where the azimuth falls by a half circle, the next one begins.
     let rank = |key: u64| f32::from_bits((key >> 32) as u32);
     if let Some(at) = of_ring.windows(2).position(|pair| rank(pair[0]) - rank(pair[1]) > 2.0) {

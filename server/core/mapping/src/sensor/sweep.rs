@@ -12,12 +12,15 @@ use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
 use crate::event::Scan;
+use crate::sensor::deviation::Deviation;
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{ScanKnots, knots};
 use crate::sensor::self_filter::{FilterReason, RemovedPoints, SelfFilter};
 
 /// Greatest coordinate of a position, metres. Ours: no sensor of the family reaches half as far.
 const POSITION_M_MAX: f32 = 1000.0;
+/// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
+const CHUNK: usize = 1024;
 
 /// How a sensor is mounted on its vehicle.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,12 +48,9 @@ pub struct Sweep {
     pub y: Vec<f32>,
     /// Height over the ground under the vehicle, metres.
     pub z: Vec<f32>,
-    /// Deviation of each range from the mean of its laser's neighbouring ranges, over the range itself: metres per
-    /// metre of distance from the sensor that measured the point. NaN if it is unknown. Empty until
-    /// [`Sweep::set_deviations`] or [`Sweep::set_scan_deviations`] fills it.
-    pub deviation: Vec<f32>,
-    /// Standard deviation of the sensor's range noise over the range, as long as `deviation`; NaN where that is.
-    pub noise: Vec<f32>,
+    /// Deviation of each range from its neighbours. Empty until [`Sweep::set_deviations`] or
+    /// [`Sweep::set_scan_deviations`] fills it.
+    pub deviation: Vec<Deviation>,
     /// Number of returns before the vehicle's own were removed.
     pub returns: u32,
     /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all cells of
@@ -128,9 +128,9 @@ impl Sweep {
         removed
     }
 
-    /// Fills in deviation and noise of each point that [`Sweep::set_moving_revolution`] kept of the same revolution
-    /// with the same filter. `noise_m` is the standard deviation of the sensor's range noise, metres. The deviations of
-    /// a second echo are NaN: it has no series.
+    /// Fills in the deviation of each point that [`Sweep::set_moving_revolution`] kept of the same revolution with the
+    /// same filter. `noise_m` is the standard deviation of the sensor's range noise, metres. The deviations of a second
+    /// echo are unknown: it has no series.
     pub fn set_deviations(
         &mut self,
         revolution: &Revolution,
@@ -156,25 +156,28 @@ impl Sweep {
     ) {
         // Without a branch, as in `fill`.
         let slots = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum::<usize>() + 1;
-        self.deviation.resize(slots, f32::NAN);
-        self.noise.resize(slots, f32::NAN);
-        let mut kept = 0;
+        self.deviation.resize(slots, Deviation::UNKNOWN);
+        let (mut kept, mut found) = (0, [Deviation::UNKNOWN; CHUNK]);
         for (number, echo) in revolution.echoes.iter().enumerate() {
             let unknown = if number == 0 { 1.0 } else { f32::NAN };
-            let slots = echo.range_m.iter().zip(first).zip(&echo.x).zip(&echo.y).zip(&echo.z);
-            for ((((&range, &deviation_m), &x), &y), &z) in slots {
-                let per_m = unknown / range;
-                (self.deviation[kept], self.noise[kept]) = (deviation_m * per_m, noise_m * per_m);
-                let is_far = range > 0.0 && range >= mount.range_m_min;
-                kept += usize::from(is_far && check([x, y, z]).is_none());
+            for (chunk, (ranges_m, first)) in echo.range_m.chunks(CHUNK).zip(first.chunks(CHUNK)).enumerate() {
+                for (found, (&range_m, &deviation_m)) in found.iter_mut().zip(ranges_m.iter().zip(first)) {
+                    let per_m = unknown / range_m;
+                    *found = Deviation::new(deviation_m * per_m, noise_m * per_m);
+                }
+                for (slot, (&range_m, &found)) in (chunk * CHUNK..).zip(ranges_m.iter().zip(&found)) {
+                    self.deviation[kept] = found;
+                    let is_far = range_m > 0.0 && range_m >= mount.range_m_min;
+                    let at = || [echo.x[slot], echo.y[slot], echo.z[slot]];
+                    kept += usize::from(is_far && check(at()).is_none());
+                }
             }
         }
         self.deviation.truncate(kept);
-        self.noise.truncate(kept);
     }
 
-    /// Fills in deviation and noise of each point that [`Sweep::set_moving_scan`] kept of the same scan with the same
-    /// filter. `deviations_m` has one entry for each point of the scan, metres ([`crate::sensor::ring_series`]).
+    /// Fills in the deviation of each point that [`Sweep::set_moving_scan`] kept of the same scan with the same filter.
+    /// `deviations_m` has one entry for each point of the scan, metres ([`crate::sensor::ring_series`]).
     pub fn set_scan_deviations(
         &mut self,
         scan: &Scan,
@@ -184,15 +187,25 @@ impl Sweep {
         filter: Option<&SelfFilter>,
     ) {
         let check = filter.map(|filter| check(mount, filter));
-        let points = scan.x.iter().zip(&scan.y).zip(&scan.z).zip(deviations_m);
-        for (((&x, &y), &z), &deviation_m) in points {
-            let is_removed = check.as_ref().is_some_and(|check| check([x, y, z]).is_some());
-            if Self::keeps(mount, [x, y, z]) && !is_removed {
-                let range_m = squared_range(x, y, z).sqrt();
-                self.deviation.push(deviation_m / range_m);
-                self.noise.push(if deviation_m.is_nan() { f32::NAN } else { noise_m / range_m });
+        // Without a branch, as in `fill`.
+        self.deviation.resize(scan.x.len() + 1, Deviation::UNKNOWN);
+        let (mut kept, mut found, mut keeps) = (0, [Deviation::UNKNOWN; CHUNK], [false; CHUNK]);
+        let points = scan.x.chunks(CHUNK).zip(scan.y.chunks(CHUNK)).zip(scan.z.chunks(CHUNK));
+        for (((xs, ys), zs), deviations_m) in points.zip(deviations_m.chunks(CHUNK)) {
+            let n = xs.len();
+            let (ys, zs, deviations_m) = (&ys[..n], &zs[..n], &deviations_m[..n]);
+            for i in 0..n {
+                let range_m = squared_range(xs[i], ys[i], zs[i]).sqrt();
+                found[i] = Deviation::new(deviations_m[i] / range_m, noise_m / range_m);
+                keeps[i] = Self::keeps(mount, [xs[i], ys[i], zs[i]]);
+            }
+            for i in 0..n {
+                self.deviation[kept] = found[i];
+                let is_removed = check.as_ref().is_some_and(|check| check([xs[i], ys[i], zs[i]]).is_some());
+                kept += usize::from(keeps[i] & !is_removed);
             }
         }
+        self.deviation.truncate(kept);
     }
 
     /// Replaces the points by those of a scan of a vehicle at rest, without a self filter. Returns the number of points
@@ -222,22 +235,32 @@ impl Sweep {
         let mut kept = 0;
         let mut returns = 0;
         let mut removed = RemovedPoints::default();
-        for (index, ((&x, &y), &z)) in scan.x.iter().zip(&scan.y).zip(&scan.z).enumerate() {
-            let transform = if moving.is_empty() {
-                at_rest
-            } else {
-                let (knot, share) = knots.position(scan.offset_ns[index]);
-                moving[knot].towards(&moving[knot + 1], share)
-            };
-            let [ex, ey, ez] = transform.apply(x, y, z);
-            (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-            let (is_position, is_return) = classify(x, y, z);
-            let is_far = is_return && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min;
-            let reason = check.as_ref().and_then(|check| check([x, y, z])).filter(|_| is_far);
-            removed.no_position += u64::from(!is_position);
-            removed.count(reason);
-            returns += u32::from(is_return);
-            kept += usize::from(is_far && reason.is_none());
+        let (mut moved, mut are_far) = ([[0.0; CHUNK]; 3], [false; CHUNK]);
+        let chunks = scan.x.chunks(CHUNK).zip(scan.y.chunks(CHUNK)).zip(scan.z.chunks(CHUNK));
+        for (chunk, ((xs, ys), zs)) in chunks.enumerate() {
+            let n = xs.len();
+            let (ys, zs) = (&ys[..n], &zs[..n]);
+            let [ex, ey, ez] = &mut moved;
+            let (ex, ey, ez, are_far) = (&mut ex[..n], &mut ey[..n], &mut ez[..n], &mut are_far[..n]);
+            // Without a branch, so that the compiler vectorises it.
+            let mut positions = 0_u32;
+            for i in 0..n {
+                let (is_position, is_return) = classify(xs[i], ys[i], zs[i]);
+                are_far[i] = is_return & is_far(mount, xs[i], ys[i], zs[i]);
+                (positions, returns) = (positions + u32::from(is_position), returns + u32::from(is_return));
+                [ex[i], ey[i], ez[i]] = at_rest.apply(xs[i], ys[i], zs[i]);
+            }
+            removed.no_position += n as u64 - u64::from(positions);
+            for i in (0..n).filter(|_| !moving.is_empty()) {
+                let (knot, share) = knots.position(scan.offset_ns[chunk * CHUNK + i]);
+                [ex[i], ey[i], ez[i]] = moving[knot].towards(&moving[knot + 1], share).apply(xs[i], ys[i], zs[i]);
+            }
+            for i in 0..n {
+                (self.x[kept], self.y[kept], self.z[kept]) = (ex[i], ey[i], ez[i]);
+                let reason = check.as_ref().and_then(|check| check([xs[i], ys[i], zs[i]])).filter(|_| are_far[i]);
+                removed.count(reason);
+                kept += usize::from(are_far[i] && reason.is_none());
+            }
         }
         self.returns = returns;
         self.truncate(kept);
@@ -250,7 +273,6 @@ impl Sweep {
             axis.clone_from(from);
         }
         self.deviation.clone_from(&other.deviation);
-        self.noise.clone_from(&other.noise);
         self.calibration.clone_from(&other.calibration);
         self.returns = other.returns;
         self.copy_mount(other);
@@ -260,13 +282,11 @@ impl Sweep {
     /// maps, those of the other sweep are used.
     pub(crate) fn append(&mut self, other: &Sweep, self_from_other: &Isometry3<f64>) {
         let transform = Transform::new(self_from_other);
-        for (own, others) in [(&mut self.deviation, &other.deviation), (&mut self.noise, &other.noise)] {
-            // A sensor without deviations has an empty list.
-            if !own.is_empty() || !others.is_empty() {
-                own.resize(self.x.len(), f32::NAN);
-                own.extend_from_slice(others);
-                own.resize(self.x.len() + other.x.len(), f32::NAN);
-            }
+        // A sensor without deviations has an empty list.
+        if !self.deviation.is_empty() || !other.deviation.is_empty() {
+            self.deviation.resize(self.x.len(), Deviation::UNKNOWN);
+            self.deviation.extend_from_slice(&other.deviation);
+            self.deviation.resize(self.x.len() + other.x.len(), Deviation::UNKNOWN);
         }
         for ((&x, &y), &z) in other.x.iter().zip(&other.y).zip(&other.z) {
             let [x, y, z] = transform.apply(x, y, z);
@@ -280,10 +300,10 @@ impl Sweep {
         }
     }
 
-    /// Adds a point that no sensor has measured in this sweep; its deviation is NaN.
+    /// Adds a point that no sensor has measured in this sweep; its deviation is unknown.
     pub(crate) fn push_remembered(&mut self, [x, y, z]: [f32; 3]) {
-        for list in [&mut self.deviation, &mut self.noise].into_iter().filter(|list| !list.is_empty()) {
-            list.push(f32::NAN);
+        if !self.deviation.is_empty() {
+            self.deviation.push(Deviation::UNKNOWN);
         }
         self.x.push(x);
         self.y.push(y);
@@ -302,7 +322,7 @@ impl Sweep {
 
     /// True if [`Sweep::set_scan`] keeps a point at this position, sensor frame, metres.
     pub fn keeps(mount: &Mount, [x, y, z]: [f32; 3]) -> bool {
-        classify(x, y, z).1 && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
+        classify(x, y, z).1 & is_far(mount, x, y, z)
     }
 
     fn prepare(&mut self, calibration: Option<&Arc<Calibration>>, mount: &Mount) {
@@ -310,7 +330,6 @@ impl Sweep {
         let at = mount.ego_from_sensor.translation;
         (self.mount_height_m, self.mount_m) = (at.z as f32, [at.x as f32, at.y as f32]);
         self.deviation.clear();
-        self.noise.clear();
     }
 
     /// Makes the arrays long enough for `slots` points, and for one more that is written and not kept.
@@ -343,8 +362,14 @@ fn transforms(mount: &Mount, end_from_ego: &[Isometry3<f64>]) -> Vec<Transform> 
 #[inline(always)]
 pub(crate) fn classify(x: f32, y: f32, z: f32) -> (bool, bool) {
     // NaN fails every comparison.
-    let is_position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
-    (is_position, is_position && squared_range(x, y, z) > 0.0)
+    let is_position = (x.abs() <= POSITION_M_MAX) & (y.abs() <= POSITION_M_MAX) & (z.abs() <= POSITION_M_MAX);
+    (is_position, is_position & (squared_range(x, y, z) > 0.0))
+}
+
+/// True if a position of the sensor frame is not within the least range.
+#[inline(always)]
+fn is_far(mount: &Mount, x: f32, y: f32, z: f32) -> bool {
+    squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
 }
 
 #[inline(always)]

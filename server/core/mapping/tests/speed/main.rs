@@ -13,6 +13,7 @@ use clearway_mapping::layer::speed::painting::{NO_ROAD, Painter, edge_points};
 use clearway_mapping::layer::speed::{Speed, painting_conditions};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::road::{self, StoredRoad};
+use clearway_mapping::sensor::deviation::Deviation;
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 use proptest::prelude::*;
@@ -424,9 +425,8 @@ proptest! {
 fn rough_ground_is_slower_than_smooth_ground_of_the_same_height() {
     let mut sweep = level();
     // The deviations on the left are those of a field, on the right those of a road.
-    sweep.noise = vec![0.001; sweep.x.len()];
-    sweep.deviation =
-        (0..sweep.x.len()).map(|i| if sweep.y[i] < 0.0 { 0.0 } else { 0.02 * (-1.0_f32).powi(i as i32) }).collect();
+    let share = |i: usize| if sweep.y[i] < 0.0 { 0.0 } else { 0.02 * (-1.0_f32).powi(i as i32) };
+    sweep.deviation = (0..sweep.x.len()).map(|i| Deviation::new(share(i), 0.001)).collect();
     let at = |config: &SpeedConfig, y: f32| {
         let layer = make(config, &sweep, &Context::default());
         f64::from(values(&layer, "speed")[cell_at(&layer, 5.1, y).unwrap()]) * f64::from(SPEED_SCALE_MPS)

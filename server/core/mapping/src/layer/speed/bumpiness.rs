@@ -13,9 +13,11 @@
 
 use crate::layer::maker::Context;
 use crate::layer::radial_grid::floor_to_whole;
+use crate::layer::roughness::NOWHERE;
 use crate::sensor::sweep::Sweep;
 
 use super::config::SpeedConfig;
+use super::rough_ground::RoughGround;
 
 /// Bumpiness of an obstacle.
 pub const OBSTACLE_BUMPINESS: f32 = f32::INFINITY;
@@ -30,8 +32,8 @@ const HEIGHT_M_MAX: f32 = 20.0;
 const OFFSET_MM: f32 = 20_000.5;
 /// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
 const CHUNK: usize = 256;
-/// Cell of a point that lies in no cell.
-const NOWHERE: u32 = u32::MAX;
+/// Height of a point that lies too low for a height map, mm.
+const NOT_USED: i32 = i32::MIN;
 /// Sums of one cell's heights, mm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Cell {
@@ -101,8 +103,14 @@ impl HeightMap {
         self.seen.iter().map(|cell| *cell as usize)
     }
 
-    /// Replaces the points by those of a sweep.
-    pub fn update(&mut self, sweep: &Sweep, context: &Context<'_>, config: &SpeedConfig) {
+    /// Replaces the points by those of a sweep, here and in `rough_ground`.
+    pub fn update(
+        &mut self,
+        sweep: &Sweep,
+        context: &Context<'_>,
+        config: &SpeedConfig,
+        rough_ground: &mut RoughGround,
+    ) {
         for &cell in &self.seen {
             self.cells[cell as usize] = EMPTY;
             self.means_m[cell as usize] = f32::NAN;
@@ -111,6 +119,9 @@ impl HeightMap {
         self.seen.clear();
         let (mut cells, mut millimetres, mut over_ground) = ([NOWHERE; CHUNK], [0; CHUNK], [0; CHUNK]);
         let lowest_m = if context.ground.is_some() { LOWEST_M } else { LOWEST_OVER_PLANE_M };
+        rough_ground.clear(sweep, self.cells.len());
+        // A sweep without deviations has an empty list.
+        let mut deviations = sweep.deviation.chunks(CHUNK);
         let heights_m = context.heights_m(sweep).chunks(CHUNK);
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
         for (((xs, ys), zs), heights) in chunks.zip(heights_m) {
@@ -120,8 +131,12 @@ impl HeightMap {
                 &mut cells,
                 [&mut millimetres, &mut over_ground],
             );
+            rough_ground.add_points(&cells, deviations.next().unwrap_or_default());
             for ((&cell, &millimetres), &over_ground) in cells.iter().zip(&millimetres).zip(&over_ground).take(xs.len())
             {
+                if over_ground == NOT_USED {
+                    continue;
+                }
                 if let Some(sums) = self.cells.get_mut(cell as usize) {
                     if sums.points == 0 {
                         self.seen.push(cell);
@@ -132,7 +147,8 @@ impl HeightMap {
         }
     }
 
-    /// Finds cell and height of each point. It has no branches and reads no tables, so that the compiler vectorises it.
+    /// Finds the cell of each point up to the largest height, and its heights if it is not too low. It has no branches
+    /// and reads no tables, so that the compiler vectorises it.
     fn find_cells(
         &self,
         [xs, ys, zs, heights]: [&[f32]; 4],
@@ -150,13 +166,15 @@ impl HeightMap {
             let (z, height) = (zs[i], heights[i]);
             // NaN fails every comparison.
             let within = (ix >= 0.0) & (ix < side) & (iy >= 0.0) & (iy < side);
-            let inside = within & (height > lowest_m) & (height <= highest_m) & (z.abs() < HEIGHT_M_MAX);
-            let [ix, iy, z, height] = [ix, iy, z * 1000.0 + OFFSET_MM, height * 1000.0 + OFFSET_MM]
-                .map(|value| floor_to_whole(if inside { value } else { 0.0 }));
+            let inside = within & (height <= highest_m);
+            let is_used = inside & (height > lowest_m) & (z.abs() < HEIGHT_M_MAX);
+            let [ix, iy] = [ix, iy].map(|index| floor_to_whole(if inside { index } else { 0.0 }));
+            let [z, height] = [z * 1000.0 + OFFSET_MM, height * 1000.0 + OFFSET_MM]
+                .map(|value| floor_to_whole(if is_used { value } else { 0.0 }));
             cells[i] = if inside { iy * self.side as u32 + ix } else { NOWHERE };
             // The value is positive before the cast, so that the cast rounds.
             millimetres[i] = z as i32 - OFFSET_MM as i32;
-            over_ground[i] = height as i32 - OFFSET_MM as i32;
+            over_ground[i] = if is_used { height as i32 - OFFSET_MM as i32 } else { NOT_USED };
         }
     }
 
@@ -226,11 +244,8 @@ mod tests {
             let heights = [-1.5, -0.5, 0.5, 1.5].map(|share: f32| middle_m + share * spread_m);
             let mut map = HeightMap::new(80, 0.25);
             for _ in 0..2 {
-                map.update(
-                    &Sweep { x: vec![5.1; 4], y: vec![-3.1; 4], z: heights.into(), ..Sweep::default() },
-                    &context,
-                    &config,
-                );
+                let sweep = Sweep { x: vec![5.1; 4], y: vec![-3.1; 4], z: heights.into(), ..Sweep::default() };
+                map.update(&sweep, &context, &config, &mut RoughGround::default());
                 map.judge(&context, &config);
             }
             let [cell] = map.known().collect::<Vec<_>>()[..] else { panic!("one cell is known") };

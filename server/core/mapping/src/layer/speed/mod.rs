@@ -202,9 +202,8 @@ impl LayerMaker for Speed {
     }
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
-        self.heights.update(sweep, context, &self.config);
+        self.heights.update(sweep, context, &self.config, &mut self.rough_ground);
         self.heights.judge(context, &self.config);
-        self.rough_ground.update(sweep, context.heights_m(sweep), self.heights.side(), &self.config);
         self.paint(sweep, context);
         layer.geometry = self.geometry();
         self.write(context, layer);

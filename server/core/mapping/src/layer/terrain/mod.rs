@@ -11,7 +11,7 @@
 //! | hierarchical division into flat regions, or each cell by itself | sections 2.2 and 2.3 | [`regions`] |
 //! | regions on the local ground that the vehicle can reach | not in the paper | [`crate::ground`], [`crate::reach`] |
 //! | bounded inference | not in the paper | [`holes`] |
-//! | roughness of flat cells | sections 2.4 and 2.5, eq. 3 and 4 | [`crate::sensor::distance_series`], [`Roughness`] |
+//! | roughness of flat cells | sections 2.4 and 2.5, eq. 3 and 4 | [`crate::sensor::distance_series`], [`roughness`] |
 //!
 //! There are three variants ([`Variant`]):
 //! - `paper`: as published. Car roofs are flat, and cells far beyond the last point are inferred.
@@ -20,6 +20,8 @@
 //! - `grid`: each cell by itself, with the shape of its points.
 //!
 //! The result does not depend on the order of the points: all sums are over whole numbers.
+//!
+//! [`roughness`]: crate::layer::roughness
 
 pub mod class;
 pub mod config;
@@ -33,7 +35,6 @@ use crate::layer::channel::TypedChannel;
 use crate::layer::class::{count_cells, drivable_share};
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
-use crate::layer::roughness::Roughness;
 use crate::sensor::sweep::Sweep;
 
 use class::{PLANE, ROUGHNESS, SHAPE, TerrainClass};
@@ -49,7 +50,6 @@ pub struct Terrain {
     cells: Cells,
     regions: Regions,
     holes: Holes,
-    roughness: Roughness,
     /// One bit for each cell, set if a point fell into it.
     seen: Vec<u64>,
     /// By cell.
@@ -64,7 +64,6 @@ impl Terrain {
             cells: Cells::new(config.range_m_max, config.cell_m, config.variant.division()),
             regions: Regions::default(),
             holes: Holes::default(),
-            roughness: Roughness::default(),
             seen: Vec::new(),
             class: Vec::new(),
         }
@@ -148,19 +147,15 @@ impl Terrain {
     }
 
     /// Writes the roughness of the flat cells (section 2.4); `raw` is empty before.
-    fn write_roughness(&mut self, sweep: &Sweep, raw: &mut Vec<u8>) {
+    fn write_roughness(&self, sweep: &Sweep, raw: &mut Vec<u8>) {
         raw.resize(self.class.len(), ROUGHNESS.unknown);
         if sweep.deviation.is_empty() {
             return;
         }
-        self.roughness.clear(self.cells.slots());
-        self.roughness.add_points(self.cells.numbers_of_points(), &sweep.deviation, &sweep.noise);
-        for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
+        for &cell in self.regions.cell_of_slot() {
             let cell = cell as usize;
             let is_flat = matches!(self.class[cell], TerrainClass::Flat | TerrainClass::FlatUnreachable);
-            let number = self.cells.number_of_slot(slot);
-            let known = self.roughness.of_cell(number, self.config.roughness_points_min).filter(|_| is_flat);
-            if let Some(roughness) = known {
+            if is_flat && let Some(roughness) = self.cells.roughness(cell, self.config.roughness_points_min) {
                 let steps = (roughness / ROUGHNESS.scale).round() as u32;
                 raw[cell] = steps.min(u32::from(ROUGHNESS.unknown) - 1) as u8;
             }

@@ -6,7 +6,7 @@
 //!
 //! Sums of whole numbers are exact, so that they do not depend on the order of the points.
 
-use crate::layer::roughness::NOWHERE;
+use crate::layer::roughness::{NOWHERE, Roughness};
 use crate::sensor::sweep::Sweep;
 
 use super::division::{Division, Region, cell_of_rank};
@@ -93,8 +93,8 @@ pub struct Cells {
     numbered: Vec<u32>,
     /// By number of a cell: the sums over its points, and the heights of its lowest and highest point, mm.
     sums_of_number: Vec<(Moments, [f32; 2])>,
-    /// Number of the cell of each point.
-    number_of_point: Vec<u32>,
+    /// By number of a cell: its roughness.
+    roughness: Roughness,
     /// One bit for each cell of the grid, by rank: set if the cell has a point.
     occupied: Vec<u64>,
     /// Number of occupied cells before each word of `occupied`.
@@ -157,24 +157,28 @@ impl Cells {
     fn sum_cells(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
         self.numbered.drain(..).for_each(|cell| self.number_of_cell[cell as usize] = NOWHERE);
         self.sums_of_number.clear();
-        self.number_of_point.clear();
+        self.roughness.clear(0);
         let (mut cells, mut points) = ([NOWHERE; CHUNK], [[0.0; CHUNK]; 3]);
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        // A sweep without deviations has an empty list.
+        let mut deviations = sweep.deviation.chunks(CHUNK);
         for (((xs, ys), zs), heights_m) in chunks.zip(heights_m.chunks(CHUNK)) {
             self.find_cells([xs, ys, heights_m], overhang_m, &mut cells);
             for (millimetres_of, metres) in points.iter_mut().zip([xs, ys, zs]) {
                 millimetres_of.iter_mut().zip(metres).for_each(|(mm, metres)| *mm = millimetres(*metres));
             }
             let [xs, ys, zs] = &points;
-            for (i, &cell) in cells[..heights_m.len()].iter().enumerate() {
+            for i in 0..heights_m.len() {
+                let cell = cells[i];
                 let number = self.number(cell);
-                self.number_of_point.push(number);
+                cells[i] = number;
                 if let Some((sums, [low, high])) = self.sums_of_number.get_mut(number as usize) {
                     let z = zs[i];
                     sums.add([xs[i], ys[i], z]);
                     (*low, *high) = (if z < *low { z } else { *low }, if z > *high { z } else { *high });
                 }
             }
+            self.roughness.add_points(&cells, deviations.next().unwrap_or_default());
         }
     }
 
@@ -206,6 +210,7 @@ impl Cells {
             *number = self.numbered.len() as u32;
             self.numbered.push(cell);
             self.sums_of_number.push((Moments::default(), [f32::INFINITY, -f32::INFINITY]));
+            self.roughness.push_cell();
         }
         *number
     }
@@ -297,14 +302,9 @@ impl Cells {
         self.cell_of_rank[self.rank_of_slot[slot] as usize] as usize
     }
 
-    /// By point, in the sweep's order: the number of its cell; [`NOWHERE`] for points that are left out.
-    pub fn numbers_of_points(&self) -> &[u32] {
-        &self.number_of_point
-    }
-
-    /// By slot: the number of its cell.
-    pub fn number_of_slot(&self, slot: usize) -> usize {
-        self.number_of_cell[self.cell_of_slot(slot)] as usize
+    /// Roughness of a cell of the grid; `None` with fewer deviations than `points_min`. The cell must have a point.
+    pub fn roughness(&self, cell: usize, points_min: u16) -> Option<f32> {
+        self.roughness.of_cell(self.number_of_cell[cell] as usize, points_min)
     }
 }
 
