@@ -195,20 +195,89 @@ fn a_repaired_recording_is_whole_and_has_all_that_can_be_read() {
     assert_eq!(verify(&folder.path().join("whole.mcap")).unwrap(), verify(&golden()).unwrap());
 }
 
-#[test]
-fn a_file_damaged_outside_of_its_chunks_is_repaired_without_a_loss() {
+/// What `clearway repair --json` says of the golden recording with this damage, and its exit code.
+fn repaired(change: impl FnOnce(&mut Vec<u8>)) -> (String, Option<i32>) {
     let folder = tempfile::tempdir().unwrap();
     let mut bytes = in_chunks();
-    // Within the offsets of the messages, which nothing reads but the check of the section.
-    let index = records(&bytes, op::MESSAGE_INDEX)[2];
-    bytes[index + 20..index + 24].fill(0xff);
+    change(&mut bytes);
     std::fs::write(folder.path().join("damaged.mcap"), &bytes).unwrap();
     let output = run(folder.path(), "clearway", &["repair", "damaged.mcap", "repaired.mcap", "--json"]);
+    let read = McapReader::open(&folder.path().join("repaired.mcap")).unwrap().count();
     let said = text(&output.stdout);
-    assert_eq!(output.status.code(), Some(0), "{said}{}", text(&output.stderr));
-    assert!(said.contains("\"lost_messages\": 0") && said.contains("outside of its chunks"), "{said}");
-    let count = |file: &Path| McapReader::open(file).unwrap().count();
-    assert_eq!(count(&folder.path().join("repaired.mcap")), count(&golden()));
+    assert!(said.contains(&format!("\"messages\": {read},")), "{said}");
+    (said, output.status.code())
+}
+
+#[test]
+fn a_repair_without_a_loss_ends_with_success() {
+    let all = McapReader::open(&golden()).unwrap().count();
+    // The offsets of two messages in an index, and the summary, which the new file has of its own.
+    let (said, code) = repaired(|bytes| {
+        let index = records(bytes, op::MESSAGE_INDEX)[2];
+        bytes[index + 23..index + 25].fill(0xff);
+    });
+    assert!(said.contains("a message index does not agree with its chunk"), "{said}");
+    assert!(code == Some(0) && said.contains(&format!("\"messages\": {all},")), "{code:?}: {said}");
+    let (said, code) = repaired(|bytes| {
+        let statistics = records(bytes, op::STATISTICS)[0];
+        bytes[statistics + 9] ^= 1;
+    });
+    assert!(said.contains("the CRC of the summary section") && said.contains("\"lost_messages\": null"), "{said}");
+    assert!(code == Some(0) && said.contains(&format!("\"messages\": {all},")), "{code:?}: {said}");
+}
+
+#[test]
+fn a_record_with_a_wrong_length_costs_that_record() {
+    let all = McapReader::open(&golden()).unwrap().count();
+    for kind in [op::HEADER, op::METADATA, op::ATTACHMENT] {
+        // The third byte of its length: the record then ends within the file, some chunks later.
+        let (said, code) = repaired(|bytes| {
+            let record = records(bytes, kind)[0];
+            bytes[record + 3] ^= 1;
+        });
+        assert!(code == Some(1) && said.contains(&format!("\"messages\": {all},")), "{kind}, {code:?}: {said}");
+    }
+}
+
+#[test]
+fn a_repair_names_a_lost_attachment_and_changed_metadata() {
+    let (said, code) = repaired(|bytes| {
+        let attachment = records(bytes, op::ATTACHMENT)[0];
+        bytes[attachment + 100..attachment + 104].fill(b'#');
+    });
+    assert!(said.contains("the attachment \\\"config.toml\\\"") && said.contains("CRC"), "{said}");
+    assert!(code == Some(1) && said.contains("\"lost_messages\": 0"), "{code:?}: {said}");
+    let (said, code) = repaired(|bytes| {
+        let key = bytes.windows(7).position(|text| text == b"boot_id").unwrap();
+        // The first digit of its value, behind the value's length.
+        bytes[key + 7 + 4] ^= 1;
+    });
+    assert!(code == Some(1) && said.contains("the CRC of the data section"), "{code:?}: {said}");
+    let (said, code) = repaired(|bytes| {
+        let metadata = records(bytes, op::METADATA)[0];
+        bytes[metadata + 60] ^= 1;
+    });
+    assert!(code == Some(1) && said.contains("metadata: "), "{code:?}: {said}");
+}
+
+#[test]
+fn a_repair_believes_neither_damaged_counts_nor_times_outside_of_a_chunk() {
+    let (said, code) = repaired(|bytes| {
+        let chunk = records(bytes, op::CHUNK)[2];
+        bytes[chunk + 100] ^= 1;
+        // The greatest byte of the first time of the index behind it.
+        let index = *records(bytes, op::MESSAGE_INDEX).iter().find(|at| **at > chunk).unwrap();
+        bytes[index + 9 + 2 + 4 + 7] = 0xff;
+        // The file's own count becomes what can be read.
+        let statistics = records(bytes, op::STATISTICS)[0];
+        bytes[statistics + 9..statistics + 17].fill(0);
+    });
+    assert!(code == Some(1) && said.contains("\"lost_messages\": null"), "{code:?}: {said}");
+    assert!(said.contains("\"/car/journal\""), "the index names the lost messages: {said}");
+    let report: serde_json::Value = serde_json::from_str(&said).unwrap();
+    let (from, to) = (&report["damage"][0]["lost_from_ns"], &report["damage"][0]["lost_to_ns"]);
+    let seconds = (to.as_u64().unwrap() - from.as_u64().unwrap()) / 1_000_000_000;
+    assert_eq!(seconds, 0, "from {from} to {to}");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use mcap::records::{Channel, MessageHeader, Record, SchemaHeader};
 use rusqlite::{Connection, OpenFlags, params};
 
 use super::chunk::RECORD_BYTES_MAX;
-use super::mcap_records::LostPart;
+use super::damage::LostPart;
 
 /// Number of messages that are read at once. Ours: a message of points has about a megabyte.
 const BATCH: i64 = 16;
@@ -77,7 +77,7 @@ impl BagRecords {
             self.has_ended = true;
             let reason = format!("the messages after {} cannot be read: {error}", self.newest.0);
             let bytes = (self.bytes_read, self.bytes_read);
-            self.lost.push(LostPart { bytes, reason, log_ns: None, messages: BTreeMap::new() });
+            self.lost.push(LostPart::new(bytes, reason, true));
         }
         self.waiting.pop_front()
     }

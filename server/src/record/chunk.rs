@@ -6,7 +6,7 @@
 use std::borrow::Cow;
 use std::io::Read;
 
-use mcap::records::{ChunkHeader, Record, op};
+use mcap::records::{ChunkHeader, MessageIndexEntry, Record, op};
 use mcap::{McapError, parse_record};
 
 /// Greatest length of a record, and of a decompressed chunk, in bytes. Ours: our chunks have a few MiB; a greater
@@ -14,6 +14,8 @@ use mcap::{McapError, parse_record};
 pub(super) const RECORD_BYTES_MAX: usize = 256 << 20;
 /// Length of the head of a record: its kind (one byte) and its length (eight bytes).
 pub(super) const RECORD_HEAD_BYTES: usize = 9;
+/// Length of the head of a message, its channel (two bytes), its sequence number (four) and its log time (eight).
+const MESSAGE_START_BYTES: usize = RECORD_HEAD_BYTES + 14;
 
 /// Decompresses a chunk and checks its length and, if it has one, its CRC.
 pub(super) fn decompress<'a>(header: &ChunkHeader, data: &'a [u8]) -> Result<Cow<'a, [u8]>, McapError> {
@@ -54,6 +56,42 @@ pub(super) fn split_record<'a>(content: &mut &'a [u8]) -> Result<Record<'a>, Mca
     let (body, rest) = rest.split_at_checked(length).ok_or(McapError::UnexpectedEoc)?;
     *content = rest;
     parse(head[0], body)
+}
+
+/// True if an entry of a chunk's index leads to a message of this channel with the entry's time.
+pub(super) fn is_message(content: &[u8], channel_id: u16, entry: &MessageIndexEntry) -> bool {
+    let at = usize::try_from(entry.offset).ok();
+    let message = at.and_then(|at| content.get(at..)?.get(..MESSAGE_START_BYTES));
+    message.is_some_and(|bytes| message_of(bytes) == Some((channel_id, entry.log_time)))
+}
+
+/// The body of the index of the messages of this channel, in their order in the chunk.
+pub(super) fn index_of(content: &[u8], channel_id: u16) -> Vec<u8> {
+    let (mut entries, mut at) = (Vec::new(), 0_usize);
+    while let Some(bytes) = content.get(at..).and_then(|rest| rest.get(..MESSAGE_START_BYTES)) {
+        if let Some((_, log_time)) = message_of(bytes).filter(|(channel, _)| *channel == channel_id) {
+            entries.extend(log_time.to_le_bytes());
+            entries.extend((at as u64).to_le_bytes());
+        }
+        let length = u64::from_le_bytes(bytes[1..RECORD_HEAD_BYTES].try_into().expect("eight bytes"));
+        at = at.saturating_add(RECORD_HEAD_BYTES).saturating_add(usize::try_from(length).unwrap_or(usize::MAX));
+    }
+    let length = u32::try_from(entries.len()).unwrap_or(u32::MAX);
+    [&channel_id.to_le_bytes()[..], &length.to_le_bytes(), &entries].concat()
+}
+
+/// The channel and the log time of the message that starts with these bytes; `None` if it is another record.
+fn message_of(bytes: &[u8]) -> Option<(u16, u64)> {
+    let fields = bytes.get(RECORD_HEAD_BYTES..).filter(|_| bytes[0] == op::MESSAGE)?;
+    let channel_id = u16::from_le_bytes(fields[..2].try_into().ok()?);
+    Some((channel_id, u64::from_le_bytes(fields[6..14].try_into().ok()?)))
+}
+
+/// The name of an attachment, from the body of its record; `None` if it has none that can be read.
+pub(super) fn attachment_name(body: &[u8]) -> Option<String> {
+    let length = u32::from_le_bytes(body.get(16..20)?.try_into().ok()?) as usize;
+    let name = body.get(20..)?.get(..length)?;
+    Some(String::from_utf8_lossy(name).into_owned())
 }
 
 /// Parses a record. Refuses an attachment that ends before its CRC, at which `mcap` would panic.

@@ -8,14 +8,15 @@ use mcap::records::Record;
 
 #[cfg(feature = "sqlite")]
 use super::bag_records::BagRecords;
-use super::mcap_records::{LostPart, McapRecords, RecordsError};
+use super::damage::LostPart;
+use super::mcap_records::{McapRecords, RecordsError};
 
 /// First bytes of a bag in sqlite.
 const SQLITE: &[u8] = b"SQLite format 3\0";
 
 /// The records of a file while it is read.
 pub(super) enum FileRecords {
-    Mcap(McapRecords),
+    Mcap(Box<McapRecords>),
     #[cfg(feature = "sqlite")]
     Bag(Box<BagRecords>),
 }
@@ -36,7 +37,7 @@ impl FileRecords {
             }
             file.rewind()?;
         }
-        Ok(Self::Mcap(McapRecords::new(file, any_start)))
+        Ok(Self::Mcap(Box::new(McapRecords::new(file, any_start))))
     }
 
     /// Number of bytes read so far.
@@ -54,6 +55,15 @@ impl FileRecords {
             Self::Mcap(records) => records.has_footer(),
             #[cfg(feature = "sqlite")]
             Self::Bag(records) => records.has_end(),
+        }
+    }
+
+    /// True if the file's own counts can be trusted.
+    pub(super) fn has_sound_counts(&self) -> bool {
+        match self {
+            Self::Mcap(records) => records.has_sound_summary(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(_) => false,
         }
     }
 

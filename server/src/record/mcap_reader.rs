@@ -21,7 +21,7 @@ use crate::base::file_advice::advised;
 
 use super::damage::Damage;
 use super::file_records::FileRecords;
-use super::mcap_records::{LostPart, McapRecords, RecordsError};
+use super::mcap_records::{McapRecords, RecordsError};
 use super::mcap_summary;
 
 /// Version of the contents of our recordings, in their metadata. A recording without one has version 1.
@@ -193,7 +193,7 @@ pub struct McapReader {
     first: Option<Message>,
     /// Number of messages of channels that no record describes.
     unknown: u64,
-    /// Number of messages by the file's own count, and by channel.
+    /// Number of messages by the file's own count, and by channel; dropped at the end if it cannot be trusted.
     stated: Option<(u64, BTreeMap<u16, u64>)>,
     /// Number of messages by channel.
     read: BTreeMap<u16, u64>,
@@ -217,7 +217,7 @@ impl McapReader {
     /// # Errors
     /// As [`McapReader::open`].
     pub fn from_source(file: &Path, source: impl Read + Send + 'static) -> Result<Self, McapReadError> {
-        Self::new(file, FileRecords::Mcap(McapRecords::new(source, false)), false)
+        Self::new(file, FileRecords::Mcap(Box::new(McapRecords::new(source, false))), false)
     }
 
     /// Opens a file to read its records; its first bytes may be damaged too.
@@ -271,13 +271,7 @@ impl McapReader {
 
     /// The damaged parts so far.
     pub fn damages(&self) -> Vec<Damage> {
-        let damage = |lost: &LostPart| Damage {
-            bytes: lost.bytes,
-            reason: lost.reason.clone(),
-            log_ns: lost.log_ns,
-            messages: lost.messages.iter().map(|(id, count)| (self.topic(*id), *count)).collect(),
-        };
-        self.records.lost().iter().map(damage).collect()
+        self.records.lost().iter().map(|part| Damage::new(part, |id| self.topic(id))).collect()
     }
 
     /// Number of damaged parts so far.
@@ -334,6 +328,11 @@ impl McapReader {
         faults
     }
 
+    /// Number of messages by the file's own count, if it can be trusted; `None` before the last message.
+    pub(super) fn stated_messages(&self) -> Option<u64> {
+        self.stated.as_ref().filter(|_| self.has_ended).map(|(messages, _)| *messages)
+    }
+
     fn topic(&self, id: u16) -> String {
         self.channels.get(&id).map_or_else(|| format!("channel {id}"), |of| of.topic.clone())
     }
@@ -380,6 +379,7 @@ impl McapReader {
         };
         let Some(mut record) = record else {
             self.has_ended = true;
+            self.stated = self.stated.take().filter(|_| self.records.has_sound_counts());
             return Ok(None);
         };
         let is_unknown = |id: &u16| !self.channels.contains_key(id);

@@ -7,32 +7,23 @@
 use std::collections::BTreeMap;
 use std::io::{self, Read};
 
-use crc32fast::Hasher;
 use mcap::records::{MessageIndex, Record, op};
 use mcap::{MAGIC, McapError};
 
-use super::chunk::{RECORD_BYTES_MAX, RECORD_HEAD_BYTES, decompress, parse, split_record};
+use super::chunk::{RECORD_BYTES_MAX, RECORD_HEAD_BYTES, attachment_name, decompress, parse, split_record};
+use super::damage::LostPart;
+use super::section_crc::{Finding, SectionCrc};
 
 /// Bytes that a search reads at once.
 const SEARCH_BYTES: usize = 1 << 20;
 /// Length of the fields of a chunk before its data, without the name of its compression.
 const CHUNK_FIELDS_BYTES: usize = 40;
+/// Greatest length of fields that a later version of the format adds to a record. Ours.
+const ADDED_BYTES_MAX: usize = 1024;
 /// Least kind of the records that programs define for themselves.
 const PRIVATE: u8 = 0x80;
 /// Names of the compressions, as chunks have them.
 const COMPRESSIONS: [&[u8]; 3] = [b"", b"zstd", b"lz4"];
-
-/// A part of a file that cannot be read.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct LostPart {
-    /// The bytes of the file from the first up to, without, the second.
-    pub(super) bytes: (u64, u64),
-    pub(super) reason: String,
-    /// Least and greatest log time of the lost messages, if known; ns since the Unix epoch.
-    pub(super) log_ns: Option<(u64, u64)>,
-    /// Number of lost messages, by id of the channel, as far as known.
-    pub(super) messages: BTreeMap<u16, u64>,
-}
 
 /// The records of an MCAP file cannot be read further.
 #[derive(Debug)]
@@ -69,7 +60,9 @@ pub(super) struct McapRecords {
     /// The bytes of the chunk in the file.
     chunk_bytes: (u64, u64),
     /// CRC of the consumed bytes of the section.
-    crc: Hasher,
+    crc: SectionCrc,
+    /// Number of lost parts before the section.
+    lost_before: usize,
     /// True if a file that does not start as MCAP files do is searched for records.
     any_start: bool,
     has_chunks: bool,
@@ -78,6 +71,7 @@ pub(super) struct McapRecords {
     /// The bytes of the newest record, if it is of a private kind. Message indexes behind it say that it was a chunk.
     private: Option<(u64, u64)>,
     has_footer: bool,
+    has_sound_summary: bool,
     lost: Vec<LostPart>,
 }
 
@@ -92,12 +86,14 @@ impl McapRecords {
             section: Section::Start,
             chunk: (Vec::new(), 0),
             chunk_bytes: (0, 0),
-            crc: Hasher::new(),
+            crc: SectionCrc::default(),
+            lost_before: 0,
             any_start,
             has_chunks: false,
             indexes_are_lost: false,
             private: None,
             has_footer: false,
+            has_sound_summary: false,
             lost: Vec::new(),
         }
     }
@@ -110,6 +106,11 @@ impl McapRecords {
     /// True if the file has its closing records.
     pub(super) fn has_footer(&self) -> bool {
         self.has_footer
+    }
+
+    /// True if the file has a summary without damage, whose counts can be trusted.
+    pub(super) fn has_sound_summary(&self) -> bool {
+        self.has_sound_summary
     }
 
     /// The parts so far that cannot be read.
@@ -193,17 +194,18 @@ impl McapRecords {
                     (self.has_chunks, self.indexes_are_lost) = (true, false);
                     Ok(None)
                 }
-                Err(error) => Err((error, Some((header.message_start_time, header.message_end_time)))),
+                Err(error) => Err((error.to_string(), Some((header.message_start_time, header.message_end_time)))),
             },
             Ok(record) => Ok(Some(record.into_owned())),
-            Err(error) => Err((error, None)),
+            Err(error) => Err((reason(opcode, &self.bytes()[RECORD_HEAD_BYTES..end], &error), None)),
         };
         match read {
             Ok(record) => {
-                if matches!(record, Some(Record::DataEnd(_) | Record::Footer(_))) {
-                    self.check_section(record.as_ref(), end)?;
-                } else {
-                    self.consume(end);
+                match &record {
+                    Some(Record::DataEnd(data_end)) => self.end_data(data_end.data_section_crc, end),
+                    Some(Record::Footer(footer)) => self.end_summary(footer.summary_crc, end)?,
+                    Some(Record::MessageIndex(index)) if !self.indexes_are_lost => self.consume_index(index, end),
+                    _ => self.consume(end),
                 }
                 let private = self.private.take();
                 if let Some(Record::MessageIndex(index)) = &record {
@@ -215,61 +217,67 @@ impl McapRecords {
                 self.private = Some((from, self.offset)).filter(|_| opcode >= PRIVATE);
                 Ok(record)
             }
-            Err((error, _)) if !self.head_at(end)? => {
-                self.search(&error.to_string())?;
+            Err((reason, _)) if !self.head_at(end)? => {
+                self.search(&reason)?;
                 Ok(None)
             }
-            Err((error, log_ns)) => {
+            Err((reason, chunk_ns)) => {
                 self.consume(end);
-                self.add_lost((from, self.offset), &error);
+                self.add_lost((from, self.offset), &reason);
                 if let Some(lost) = self.lost.last_mut() {
-                    lost.log_ns = log_ns.filter(|(first, last)| first <= last && *last > 0);
+                    lost.chunk_ns = chunk_ns.filter(|(first, last)| first <= last && *last > 0);
                 }
                 Ok(None)
             }
         }
     }
 
-    /// Checks the CRC of the section that this record ends, and what follows the last record.
-    fn check_section(&mut self, record: Option<&Record<'_>>, end: usize) -> Result<(), RecordsError> {
-        let (from, is_whole) = (self.offset, self.lost.is_empty());
-        let (saved, name) = match record {
-            Some(Record::Footer(footer)) => {
-                // The CRC covers the footer up to the CRC itself.
-                let covered = end - size_of::<u32>();
-                self.consume(covered);
-                let crc = self.crc.clone().finalize();
-                self.consume(end - covered);
-                (Some((footer.summary_crc, crc)), "summary")
+    /// Consumes the record that ends the data section, and checks the section's CRC unless a part of it is lost.
+    fn end_data(&mut self, saved: u32, end: usize) {
+        let (from, crc) = (self.offset, std::mem::take(&mut self.crc));
+        self.consume(end);
+        self.crc = SectionCrc::default();
+        match crc.compare(saved) {
+            Finding::Changed(crc) if self.lost.is_empty() => {
+                self.add_lost((from, self.offset), &wrong_crc("data", crc, saved));
             }
-            Some(Record::DataEnd(data_end)) => {
-                let crc = self.crc.clone().finalize();
-                self.consume(end);
-                self.crc = Hasher::new();
-                self.section = Section::Summary;
-                (Some((data_end.data_section_crc, crc)), "data")
+            Finding::Indexes(wrong) => {
+                for bytes in wrong {
+                    let reason = "a message index does not agree with its chunk".into();
+                    self.lost.push(LostPart::new(bytes, reason, false));
+                }
             }
-            _ => (None, ""),
-        };
-        if let Some((saved, calculated)) = saved.filter(|(saved, is)| *saved != 0 && saved != is && is_whole) {
-            let reason = format!(
-                "the CRC of the {name} section is {calculated:08x} and should be {saved:08x}: bytes outside of its \
-                 chunks have changed"
-            );
-            self.add_lost((from, self.offset), &reason);
+            _ => {}
         }
-        if matches!(record, Some(Record::Footer(_))) {
-            self.has_footer = self.fill(MAGIC.len())? && self.bytes().starts_with(MAGIC);
-            self.section = Section::Ended;
-            if self.has_footer {
-                self.consume(MAGIC.len());
-                let end = self.offset;
-                while self.fill(1)? {
-                    self.consume(self.bytes().len());
-                }
-                if self.offset > end {
-                    self.add_lost((end, self.offset), &"bytes after the end of the recording");
-                }
+        self.section = Section::Summary;
+        self.lost_before = self.lost.len();
+    }
+
+    /// Consumes the footer, checks the CRC of the summary, and what follows.
+    fn end_summary(&mut self, saved: u32, end: usize) -> Result<(), RecordsError> {
+        let from = self.offset;
+        // The CRC covers the footer up to the CRC itself.
+        let covered = end - size_of::<u32>();
+        self.consume(covered);
+        let crc = self.crc.compare(saved);
+        self.consume(end - covered);
+        let is_read = self.section == Section::Summary && self.lost.len() == self.lost_before;
+        self.has_sound_summary = is_read && crc == Finding::Whole;
+        if let Finding::Changed(crc) = crc
+            && is_read
+        {
+            self.add_lost((from, self.offset), &wrong_crc("summary", crc, saved));
+        }
+        self.section = Section::Ended;
+        self.has_footer = self.fill(MAGIC.len())? && self.bytes().starts_with(MAGIC);
+        if self.has_footer {
+            self.consume(MAGIC.len());
+            let end = self.offset;
+            while self.fill(1)? {
+                self.consume(self.bytes().len());
+            }
+            if self.offset > end {
+                self.add_lost((end, self.offset), &"bytes after the end of the recording");
             }
         }
         Ok(())
@@ -277,16 +285,15 @@ impl McapRecords {
 
     /// Adds the messages of an index to the newest lost part, if they were in it.
     fn add_index(&mut self, index: &MessageIndex) {
-        let Some(lost) = self.lost.last_mut().filter(|_| self.indexes_are_lost) else { return };
-        *lost.messages.entry(index.channel_id).or_default() += index.records.len() as u64;
-        for at in index.records.iter().map(|entry| entry.log_time) {
-            lost.log_ns = Some(lost.log_ns.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
+        if let Some(lost) = self.lost.last_mut().filter(|_| self.indexes_are_lost) {
+            lost.add_index(index);
         }
     }
 
+    /// Adds a part that cannot be read. What the summary holds is a repetition.
     fn add_lost(&mut self, bytes: (u64, u64), reason: &dyn std::fmt::Display) {
-        let reason = reason.to_string();
-        self.lost.push(LostPart { bytes, reason, log_ns: None, messages: BTreeMap::new() });
+        let is_loss = matches!(self.section, Section::Start | Section::Data);
+        self.lost.push(LostPart::new(bytes, reason.to_string(), is_loss));
         self.indexes_are_lost = true;
     }
 
@@ -393,6 +400,14 @@ impl McapRecords {
         self.start += count;
         self.offset += count as u64;
     }
+
+    /// Consumes an index of the newest chunk.
+    fn consume_index(&mut self, index: &MessageIndex, count: usize) {
+        let record = &self.buffer[self.start..self.start + count];
+        self.crc.update_index(self.offset, record, index, &self.chunk.0);
+        self.start += count;
+        self.offset += count as u64;
+    }
 }
 
 /// The kind and the length of a record, from its head; no length if it is greater than any record's.
@@ -406,9 +421,25 @@ fn is_opcode(opcode: u8) -> bool {
     (op::HEADER..=op::DATA_END).contains(&opcode) || opcode >= PRIVATE
 }
 
-/// Parses a record, and refuses one whose length is not that of its fields, because its kind is damaged.
+/// Parses a record, and refuses one whose length is not that of its fields, because its kind or its length is damaged.
 fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
     let record = parse(opcode, body)?;
+    let texts = |texts: &BTreeMap<String, String>| {
+        size_of::<u32>()
+            + texts.iter().map(|(key, value)| 2 * size_of::<u32>() + key.len() + value.len()).sum::<usize>()
+    };
+    // A later version of the format may add fields at the end of these, which are short.
+    let fields = match &record {
+        Record::Header(of) => Some(8 + of.profile.len() + of.library.len()),
+        Record::Schema { header, data } => Some(14 + header.name.len() + header.encoding.len() + data.len()),
+        Record::Channel(of) => Some(12 + of.topic.len() + of.message_encoding.len() + texts(&of.metadata)),
+        Record::Metadata(of) => Some(4 + of.name.len() + texts(&of.metadata)),
+        Record::Attachment { header, data, .. } => Some(36 + header.name.len() + header.media_type.len() + data.len()),
+        _ => None,
+    };
+    if fields.is_some_and(|fields| body.len() > fields + ADDED_BYTES_MAX) {
+        return Err(McapError::UnexpectedEof);
+    }
     let length = match &record {
         Record::Footer(_) => 20,
         Record::DataEnd(_) => 4,
@@ -418,6 +449,23 @@ fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
         _ => body.len(),
     };
     if length == body.len() { Ok(record) } else { Err(McapError::UnexpectedEof) }
+}
+
+/// Why a record of this kind cannot be read, with its name if it has one.
+fn reason(opcode: u8, body: &[u8], error: &McapError) -> String {
+    match (opcode, attachment_name(body)) {
+        (op::ATTACHMENT, Some(name)) => format!("the attachment {name:?}: {error}"),
+        (op::ATTACHMENT, None) => format!("an attachment: {error}"),
+        (op::METADATA, _) => format!("metadata: {error}"),
+        _ => error.to_string(),
+    }
+}
+
+fn wrong_crc(section: &str, calculated: u32, saved: u32) -> String {
+    format!(
+        "the CRC of the {section} section is {calculated:08x} and should be {saved:08x}: records outside of its chunks \
+         have changed"
+    )
 }
 
 fn u32_at(bytes: &[u8], at: usize) -> u32 {

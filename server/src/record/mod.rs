@@ -5,6 +5,7 @@
 //! | [`writer`] | events and maps -> queue -> recorder thread |
 //! | [`mcap_file`] | events and maps -> bytes of the MCAP file |
 //! | `mcap_records`, `chunk` | the bytes of any MCAP file -> its records, and the parts that cannot be read |
+//! | `section_crc` | the bytes of a section -> whether any has changed |
 //! | `bag_records` | a ROS 2 bag in sqlite -> the same records |
 //! | `file_records` | a file of either kind -> its records |
 //! | `mcap_summary` | the end of an MCAP file -> its schemas and channels |
@@ -27,5 +28,6 @@ mod mcap_records;
 mod mcap_summary;
 pub mod reader;
 pub mod repair;
+mod section_crc;
 pub mod verify;
 pub mod writer;

@@ -19,12 +19,14 @@ pub struct Report {
     /// Number of messages of the new file.
     pub messages: u64,
     /// Number of messages that the damaged file should have and the new one lacks; `None` if the damaged file does not
-    /// say how many it should have.
+    /// say how many it should have, or says it in damaged records.
     pub lost_messages: Option<u64>,
     /// The damaged parts of the file.
     pub damages: Vec<Damage>,
     /// How the file is incomplete; `None` if it is whole.
     pub incomplete: Option<String>,
+    /// True if the new file lacks a record, or may have a changed one.
+    pub is_loss: bool,
 }
 
 impl Report {
@@ -32,6 +34,7 @@ impl Report {
     pub fn to_json(&self) -> Value {
         json!({
             "messages": self.messages, "lost_messages": self.lost_messages, "incomplete": self.incomplete,
+            "is_loss": self.is_loss,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
         })
     }
@@ -115,7 +118,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
         .create(BufWriter::new(file))
         .map_err(failed)?;
     let mut report = Report::default();
-    let (mut damages, mut stated) = (0, None);
+    let mut damages = 0;
     // Ids of the damaged file -> ids of the new one.
     let (mut schemas, mut channels) = (BTreeMap::from([(0, 0)]), BTreeMap::new());
     while let Some(record) = reader.next_record()? {
@@ -147,21 +150,19 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
                 let AttachmentHeader { log_time, create_time, name, media_type } = header;
                 writer.attach(&Attachment { log_time, create_time, name, media_type, data })
             }
-            Record::Statistics(of) => {
-                stated = Some(of.message_count);
-                Ok(())
-            }
             _ => Ok(()),
         };
         copied.map_err(failed)?;
     }
-    report.lost_messages = stated.map(|stated: u64| stated.saturating_sub(report.messages));
+    report.lost_messages = reader.stated_messages().map(|stated| stated.saturating_sub(report.messages));
     (report.damages, report.incomplete) = (reader.damages(), reader.incomplete());
     if report.messages == 0 {
         return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });
     }
+    let faults_of_end = reader.faults_of_end();
+    report.is_loss = report.damages.iter().any(|damage| damage.is_loss) || !faults_of_end.is_empty();
     let mut at_end: Vec<String> = report.damages[damages..].iter().map(ToString::to_string).collect();
-    at_end.extend(reader.faults_of_end());
+    at_end.extend(faults_of_end);
     if !at_end.is_empty() {
         writer.write_metadata(&lost_here(at_end)).map_err(failed)?;
     }

@@ -45,13 +45,16 @@ fn observe(config: &Config, vehicles: &Vehicles) -> Vec<Observed> {
     config.vehicles.iter().zip(vehicles.statuses()).map(of_vehicle).collect()
 }
 
+/// A vehicle and the name of its sensor that is lost, or none if its map is stale.
+type Condition = (usize, Option<String>);
+
 /// What was good and is no longer: only this begins a save.
 #[derive(Debug, Default)]
 struct Conditions {
-    /// Conditions that hold, by vehicle.
-    wrong: BTreeSet<(usize, String)>,
-    /// Conditions that did not hold at some time, by vehicle.
-    were_good: BTreeSet<(usize, String)>,
+    /// Conditions that hold.
+    wrong: BTreeSet<Condition>,
+    /// Conditions that did not hold at some time.
+    were_good: BTreeSet<Condition>,
 }
 
 impl Conditions {
@@ -59,16 +62,16 @@ impl Conditions {
     fn update(&mut self, rules: &[SaveRule], observed: &[Observed]) -> Option<String> {
         let mut begun = None;
         for (vehicle, Observed { is_stale, in_maps }) in observed.iter().enumerate() {
-            let stale = rules.contains(&SaveRule::MapStale).then(|| ("map-stale".to_owned(), *is_stale));
+            let stale = rules.contains(&SaveRule::MapStale).then_some((None, *is_stale));
             let sensors = in_maps.iter().filter(|_| rules.contains(&SaveRule::SensorLost));
-            let lost = sensors.map(|(sensor, is_in_map)| (format!("{}-lost", as_reason(sensor)), !is_in_map));
-            for (reason, holds) in stale.into_iter().chain(lost) {
-                let condition = (vehicle, reason.clone());
+            let lost = sensors.map(|(sensor, is_in_map)| (Some(sensor), !is_in_map));
+            for (sensor, holds) in stale.into_iter().chain(lost) {
+                let condition = (vehicle, sensor.cloned());
                 if !holds {
                     self.wrong.remove(&condition);
                     self.were_good.insert(condition);
                 } else if self.were_good.contains(&condition) && self.wrong.insert(condition) {
-                    begun.get_or_insert(reason);
+                    begun.get_or_insert_with(|| reason(sensor));
                 }
             }
         }
@@ -76,15 +79,30 @@ impl Conditions {
     }
 }
 
-/// A sensor's name with the characters and the length that a reason of a save may have.
-fn as_reason(sensor: &str) -> String {
+/// The reason of a save, with the characters and the length that it may have: the sensor that is lost, or a stale map.
+fn reason(sensor: Option<&String>) -> String {
     const LENGTH_MAX: usize = 30;
-    sensor.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).take(LENGTH_MAX).collect()
+    let Some(sensor) = sensor else { return "map-stale".into() };
+    let name = sensor.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' });
+    format!("{}-lost", name.take(LENGTH_MAX).collect::<String>())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sensors_whose_long_names_begin_alike_are_lost_one_by_one() {
+        let [first, second] = ["1", "2"].map(|last| format!("{}{last}", "a".repeat(30)));
+        let mut conditions = Conditions::default();
+        let mut update = |is_first, is_second| {
+            let in_maps = vec![(first.clone(), is_first), (second.clone(), is_second)];
+            conditions.update(&[SaveRule::SensorLost], &[Observed { is_stale: false, in_maps }])
+        };
+        let lost = Some(format!("{}-lost", "a".repeat(30)));
+        assert_eq!([update(true, true), update(false, true), update(false, false)], [None, lost.clone(), lost]);
+        assert_eq!(update(false, false), None);
+    }
 
     #[test]
     fn a_condition_begins_once_and_only_after_it_did_not_hold() {

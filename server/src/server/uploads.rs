@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
-use object_store::ObjectStore;
+use object_store::path::Path as Key;
+use object_store::{ObjectStore, ObjectStoreExt};
 
 use crate::config::Store;
 use crate::record::writer::{RecorderControl, RecorderCounts};
@@ -17,6 +18,10 @@ use crate::store::upload::{self, Prepared, UploadError};
 const PERIOD: Duration = Duration::from_secs(2);
 /// Longest time between two attempts. Ours: a store that was away for an hour gets its parts a minute after its return.
 const PERIOD_MAX: Duration = Duration::from_secs(60);
+
+/// Longest time until the store answers whether it has a part. Ours: a part itself may take a minute on a thin link,
+/// and a store that hangs is to be named before.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A file as it was when it was read: path, length, time of the newest change.
 type Seen = (PathBuf, u64, SystemTime);
@@ -32,9 +37,12 @@ enum Problem {
 /// The parts of the folder, and the store.
 struct Uploads {
     options: Store,
+    /// Age up to which a part may be in a save of the last seconds, and is not deleted.
+    saved: Duration,
     control: RecorderControl,
     counts: Arc<RecorderCounts>,
     store: Option<Arc<dyn ObjectStore>>,
+    answer_timeout: Duration,
     /// Parts that the store has confirmed, and those without an event or a map.
     settled: BTreeSet<Seen>,
     /// Parts that wait, as they were read: a store that is away costs no second reading.
@@ -42,9 +50,14 @@ struct Uploads {
 }
 
 /// Sends each finished part to the store until the task is aborted. What the store does not confirm stays, and is sent
-/// again.
-pub(super) async fn upload_finished(options: Store, control: RecorderControl, counts: Arc<RecorderCounts>) {
-    let mut uploads = Uploads::new(options, control, counts);
+/// again. With `delete`, what it confirms is deleted once it is older than `saved`.
+pub(super) async fn upload_finished(
+    options: Store,
+    saved: Duration,
+    control: RecorderControl,
+    counts: Arc<RecorderCounts>,
+) {
+    let mut uploads = Uploads::new(options, saved, control, counts);
     let mut period = PERIOD;
     loop {
         let problem = uploads.upload_all().await.err();
@@ -53,8 +66,22 @@ pub(super) async fn upload_finished(options: Store, control: RecorderControl, co
         if let Some(reason) = &reason {
             tracing::warn!(store = uploads.options.url, reason, "parts wait for the store");
         }
-        uploads.counts.set_store_problem(reason.unwrap_or_default());
-        tokio::time::sleep(period).await;
+        uploads.counts.set_store_problem(reason);
+        let until = Instant::now() + period;
+        while Instant::now() < until {
+            tokio::time::sleep(PERIOD).await;
+            let waiting = uploads.waiting().len();
+            uploads.counts.set_waiting_for_store(waiting as u64);
+        }
+    }
+}
+
+/// Says how many finished parts the store has not confirmed.
+pub(super) fn log_unconfirmed(control: &RecorderControl) {
+    let finished = control.list().into_iter().filter(|part| !part.is_unfinished);
+    let parts = finished.filter(|part| !upload::is_confirmed(Path::new(&part.file))).count();
+    if parts > 0 {
+        tracing::info!(parts, "not in the store yet: the next start sends them");
     }
 }
 
@@ -67,9 +94,9 @@ fn period_after(period: Duration, problem: Option<&Problem>) -> Duration {
 }
 
 impl Uploads {
-    fn new(options: Store, control: RecorderControl, counts: Arc<RecorderCounts>) -> Self {
+    fn new(options: Store, saved: Duration, control: RecorderControl, counts: Arc<RecorderCounts>) -> Self {
         let (store, settled, prepared) = (None, BTreeSet::new(), BTreeMap::new());
-        Self { options, control, counts, store, settled, prepared }
+        Self { options, saved, control, counts, store, answer_timeout: ANSWER_TIMEOUT, settled, prepared }
     }
 
     /// Sends the parts that wait, up to the first that the store refuses.
@@ -106,12 +133,23 @@ impl Uploads {
         outcome
     }
 
-    /// The finished parts that are not settled.
+    /// The finished parts that are not settled. Deletes those that are confirmed and old enough, if it shall.
     fn waiting(&mut self) -> Vec<(PathBuf, Seen)> {
         let mut waiting = Vec::new();
         for part in self.control.list().into_iter().filter(|part| !part.is_unfinished || part.is_left) {
             let part = PathBuf::from(part.file);
-            let Some(seen) = seen(&part).filter(|seen| !self.settled.contains(seen)) else { continue };
+            let Some(seen) = seen(&part) else { continue };
+            let is_old = seen.2.elapsed().is_ok_and(|age| age > self.saved);
+            if self.options.delete && is_old && upload::is_confirmed(&part) {
+                if let Err(error) = upload::delete_confirmed(&part) {
+                    tracing::warn!(part = %part.display(), %error, "a confirmed part cannot be deleted");
+                }
+                self.settled.remove(&seen);
+                continue;
+            }
+            if self.settled.contains(&seen) {
+                continue;
+            }
             // A restart finds the confirmation of an earlier run.
             if upload::is_confirmed(&part) {
                 self.settled.insert(seen);
@@ -137,13 +175,15 @@ impl Uploads {
             None => location::open(&self.options.url).map_err(|error| Problem::Store(error.to_string()))?,
         };
         self.store = Some(store.clone());
+        // Any answer will do, also a refusal: what is wrong then, the part's own request says.
+        let answer = tokio::time::timeout(self.answer_timeout, store.head(&Key::from("clearway"))).await;
+        let _any = answer.map_err(|_| {
+            Problem::Store(format!("{} has not answered for {:?}", self.options.url, self.answer_timeout))
+        })?;
         upload::upload_prepared(&*store, part, &self.prepared[seen]).await.map_err(|error| match error {
             UploadError::Store { .. } | UploadError::Differs { .. } => Problem::Store(error.to_string()),
             error => of_part(error),
         })?;
-        if self.options.delete {
-            upload::delete_confirmed(part).map_err(|error| Problem::Part(format!("{}: {error}", part.display())))?;
-        }
         Ok(true)
     }
 }
@@ -155,10 +195,32 @@ fn seen(part: &Path) -> Option<Seen> {
 
 #[cfg(test)]
 mod tests {
+    use object_store::memory::InMemory;
+    use object_store::throttle::{ThrottleConfig, ThrottledStore};
+
     use super::*;
     use crate::config::Recorder as Options;
     use crate::record::mcap_file::Header;
     use crate::record::writer::Recorder;
+
+    #[tokio::test]
+    async fn a_store_that_hangs_is_named_before_a_part_is_sent() {
+        let folder = tempfile::tempdir().unwrap();
+        let options = Options { file: folder.path().join("car.mcap"), ..Options::default() };
+        let (recorder, _handles) = Recorder::start(&options, &Header::default(), false).unwrap();
+        let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/drive.mcap");
+        std::fs::copy(golden, folder.path().join("car-1.part-0001.mcap")).unwrap();
+        let store = Store { url: "s3://drives".into(), delete: false };
+        let mut uploads = Uploads::new(store, Duration::ZERO, recorder.control(), recorder.counts());
+        let hangs = ThrottleConfig { wait_get_per_call: Duration::from_secs(3600), ..ThrottleConfig::default() };
+        uploads.store = Some(Arc::new(ThrottledStore::new(InMemory::new(), hangs)));
+        uploads.answer_timeout = Duration::from_millis(10);
+        let Err(Problem::Store(reason)) = uploads.upload_all().await else { panic!("the store hangs") };
+        assert_eq!(reason, "s3://drives has not answered for 10ms");
+        uploads.answer_timeout = ANSWER_TIMEOUT;
+        uploads.store = Some(Arc::new(InMemory::new()));
+        assert!(uploads.upload_all().await.is_ok(), "it has nothing of that name, and answers");
+    }
 
     #[tokio::test]
     async fn a_store_that_vanishes_for_an_hour_costs_an_attempt_a_minute_and_then_gets_every_part() {
@@ -170,7 +232,7 @@ mod tests {
         let (recorder, handles) = Recorder::start(&options, &Header::default(), false).unwrap();
         let counts = recorder.counts();
         let store = Store { url: at("store").display().to_string(), delete: false };
-        let mut uploads = Uploads::new(store, recorder.control(), counts.clone());
+        let mut uploads = Uploads::new(store, Duration::ZERO, recorder.control(), counts.clone());
         add(1);
         assert!(uploads.upload_all().await.is_ok());
         assert_eq!(counts.to_proto().store_confirmed, 1);

@@ -27,8 +27,8 @@ pub struct OpenError {
 }
 
 /// Opens a store to write: a folder by its path or as `file:///PATH`, which is created if it does not exist, or
-/// `s3://BUCKET/PREFIX`. The environment variables `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION`,
-/// `AWS_ENDPOINT_URL` (of a compatible server) and `AWS_ALLOW_HTTP` are those of the AWS tools.
+/// `s3://BUCKET/PREFIX`. The environment variables `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and
+/// `AWS_ENDPOINT_URL` (of a compatible server, also by `http`) are those of the AWS tools.
 ///
 /// # Errors
 /// [`OpenError`] for another kind of URL, a folder that cannot be created, or variables that contradict each other. A
@@ -86,8 +86,9 @@ pub fn open_existing(url: &str) -> Result<Arc<dyn ObjectStore>, OpenError> {
     })
 }
 
-/// Options from the environment that replacing the client's options would lose.
+/// An endpoint that is named by `http` is used so, as by the AWS tools.
 fn client_options() -> ClientOptions {
-    let allows_http = std::env::var("AWS_ALLOW_HTTP").is_ok_and(|value| value == "true" || value == "1");
+    let is_http = |name| std::env::var(name).is_ok_and(|url| url.starts_with("http://"));
+    let allows_http = ["AWS_ENDPOINT_URL", "AWS_ENDPOINT", "AWS_ENDPOINT_URL_S3"].into_iter().any(is_http);
     ClientOptions::new().with_allow_http(allows_http)
 }

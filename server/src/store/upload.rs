@@ -91,7 +91,7 @@ pub enum UploadError {
 }
 
 /// The reason of a store in one line: of the document in which S3 states an error, its code and message.
-fn reason(error: &object_store::Error) -> String {
+pub fn reason(error: &object_store::Error) -> String {
     let text = error.to_string();
     let Some((before, document)) = text.split_once("<?xml").or_else(|| text.split_once("<Error>")) else { return text };
     let of = |tag: &str| {

@@ -1,6 +1,6 @@
 //! `clearway recordings`: a store and a search -> the parts that it finds.
 
-use anyhow::Result;
+use anyhow::{Error, Result};
 use clap::Args;
 use serde_json::json;
 use toml::value::{Datetime, Offset};
@@ -10,6 +10,7 @@ use crate::cli::shared::output::{block_on, counted, print_line};
 use crate::record::damage::utc;
 use crate::store::index::{Entry, Found, Search, search};
 use crate::store::location;
+use crate::store::upload::reason;
 
 /// Find recordings in a store by vehicle, time, place and faults.
 #[derive(Args)]
@@ -57,9 +58,14 @@ pub fn run(options: &Options) -> Result<Exit> {
         with_faults: options.faults,
     };
     let store = location::open_existing(&options.store)?;
-    let Found { entries, without_place, unreadable } = block_on(async { Ok(search(&*store, &wanted).await?) })?;
+    let Found { entries, without_place, unreadable } = block_on(async {
+        search(&*store, &wanted)
+            .await
+            .map_err(|error| Error::msg(format!("store {}: {}", options.store, reason(&error))))
+    })?;
     if options.json {
-        print_line(&format!("{:#}", json!(entries)))?;
+        let found = json!({ "parts": entries, "without_place": without_place, "unreadable": unreadable });
+        print_line(&format!("{found:#}"))?;
     } else {
         for entry in &entries {
             print_line(&line(entry))?;

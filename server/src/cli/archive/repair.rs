@@ -15,8 +15,8 @@ use crate::record::repair::repair;
 /// ends.
 #[derive(Args)]
 #[command(
-    after_help = "Exit codes: 0 the new file has every message, 1 it lacks what is lost, 2 no message can be read and \
-    no file is written, 3 wrong use.
+    after_help = "Exit codes: 0 nothing is lost, 1 the new file lacks what is lost or may have changed, 2 no message can \
+    be read and no file is written, 3 wrong use.
 
 Example:
   clearway repair damaged.mcap repaired.mcap"
@@ -38,18 +38,17 @@ pub struct Options {
 /// the new file cannot be written.
 pub fn run(options: &Options) -> Result<Exit> {
     let report = repair(&options.input, &options.output)?;
-    let is_lost = report.incomplete.is_some() && report.lost_messages != Some(0);
     if options.json {
         print_line(&format!("{:#}", report.to_json()))?;
     } else {
         let messages = counted(report.messages, "message");
         print_line(&format!("{} has {messages} of {}", options.output.display(), options.input.display()))?;
         for damage in &report.damages {
-            print_line(&format!("{}: {damage}", if is_lost { "lost" } else { "damaged, and no message is lost" }))?;
+            print_line(&format!("{}: {damage}", if damage.is_loss { "lost" } else { "damaged, and nothing is lost" }))?;
         }
         if let Some(incomplete) = &report.incomplete {
             print_line(&format!("{} is {incomplete}", options.input.display()))?;
         }
     }
-    Ok(if is_lost { Exit::Differs } else { Exit::Good })
+    Ok(if report.is_loss { Exit::Differs } else { Exit::Good })
 }

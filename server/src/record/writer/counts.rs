@@ -1,13 +1,15 @@
 //! The counts of a recorder, which every publisher of the status reads: offered, written, dropped, durable.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use clearway_proto::v1;
 
 use super::super::mcap_file::topic_of_layer;
+use crate::base::counted::counted;
 use crate::base::sync::locked;
 use crate::config::RecordedMaps;
 
@@ -73,13 +75,14 @@ pub struct RecorderCounts {
     changing: Mutex<Changing>,
 }
 
-/// Parts that the long-term store has confirmed, those that wait for it, attempts that failed, and why the newest did.
+/// Parts that the long-term store has confirmed, those that wait for it, attempts that failed, and why the newest did
+/// and since when they do.
 #[derive(Debug, Default)]
 struct StoreCounters {
     confirmed: AtomicU64,
     waiting: AtomicU64,
     failures: AtomicU64,
-    problem: Mutex<String>,
+    problem: Mutex<Option<(String, SystemTime)>>,
 }
 
 /// What changes seldom.
@@ -87,6 +90,7 @@ struct StoreCounters {
 struct Changing {
     state: RecorderState,
     file: String,
+    folder: PathBuf,
     part: u64,
     reason: Option<String>,
     /// The first failure of the disk, which later success does not make undone.
@@ -187,6 +191,7 @@ impl RecorderCounts {
 
     pub(super) fn set_file(&self, file: String, part: u64) {
         let mut changing = locked(&self.changing);
+        changing.folder = Path::new(&file).parent().map(Path::to_owned).unwrap_or_default();
         (changing.file, changing.part, changing.state, changing.reason) = (file, part, RecorderState::Recording, None);
     }
 
@@ -202,6 +207,11 @@ impl RecorderCounts {
         changing.failure.get_or_insert_with(|| reason.to_owned());
     }
 
+    /// The folder of the newest part, also after its disk has failed; empty: the working folder.
+    pub fn folder(&self) -> PathBuf {
+        locked(&self.changing).folder.clone()
+    }
+
     /// The first failure of the disk; `None` without one.
     pub fn stop_reason(&self) -> Option<String> {
         locked(&self.changing).failure.clone()
@@ -215,6 +225,13 @@ impl RecorderCounts {
         let late = || self.is_late.load(Ordering::Relaxed).then(|| "the disk is too slow".to_owned());
         let lost = || (lost > 0).then(|| format!("{lost} events and maps are lost to the recording"));
         changing.reason.or(hung).or_else(late).or_else(lost)
+    }
+
+    /// What is wrong with the long-term store now; `None` if nothing is.
+    pub fn store_problem(&self) -> Option<String> {
+        let (reason, _) = locked(&self.store.problem).clone()?;
+        let waiting = self.store.waiting.load(Ordering::Relaxed);
+        Some(format!("{} not yet in the store: {reason}", counted(waiting, "part")))
     }
 
     /// Number of events and maps that the recording lacks, because its queue was full or its disk failed. A map counts
@@ -257,6 +274,8 @@ impl RecorderCounts {
     pub fn to_proto(&self) -> v1::RecorderStatus {
         let changing = locked(&self.changing).clone();
         let (events, maps) = self.written();
+        let store_problem = locked(&self.store.problem).clone();
+        let since = store_problem.as_ref().and_then(|(_, since)| since.duration_since(SystemTime::UNIX_EPOCH).ok());
         let durable = self.vehicles.iter().zip(&self.durable);
         v1::RecorderStatus {
             file: changing.file,
@@ -273,7 +292,8 @@ impl RecorderCounts {
             store_confirmed: self.store.confirmed.load(Ordering::Relaxed),
             store_waiting: self.store.waiting.load(Ordering::Relaxed),
             store_failures: self.store.failures.load(Ordering::Relaxed),
-            store_problem: locked(&self.store.problem).clone(),
+            store_problem: store_problem.map(|(reason, _)| reason).unwrap_or_default(),
+            store_problem_since_ns: since.map_or(0, |since| since.as_nanos() as u64),
         }
     }
 }
@@ -297,8 +317,10 @@ impl RecorderCounts {
         self.store.failures.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Notes why the store has not confirmed a part; empty: nothing is wrong.
-    pub(crate) fn set_store_problem(&self, problem: String) {
-        *locked(&self.store.problem) = problem;
+    /// Notes why the store has not confirmed a part; `None`: nothing is wrong.
+    pub(crate) fn set_store_problem(&self, reason: Option<String>) {
+        let mut problem = locked(&self.store.problem);
+        let since = problem.take().map_or_else(SystemTime::now, |(_, since)| since);
+        *problem = reason.map(|reason| (reason, since));
     }
 }

@@ -77,10 +77,11 @@ pub trait Files: Send {
     /// The path of the part while it is written.
     fn path(&self, part: u64) -> PathBuf;
 
-    /// Links these parts into a folder of their own, where they stay when old parts are deleted; returns the links.
+    /// Links those of these parts that are not deleted into a folder of their own, where they stay when old parts are
+    /// deleted; returns the links.
     ///
     /// # Errors
-    /// [`io::Error`] if the disk fails.
+    /// [`io::Error`] if all are deleted or the disk fails.
     fn keep(&mut self, parts: &[u64], name: &str) -> io::Result<Vec<PathBuf>> {
         let _ = (parts, name);
         Ok(Vec::new())
@@ -117,6 +118,9 @@ impl Folder {
         if !folder.replaces && is_taken(&folder.file) {
             return Err(ErrorKind::AlreadyExists.into());
         }
+        for left in folder.list().into_iter().filter(|part| part.is_left) {
+            tracing::warn!(file = left.file, bytes = left.bytes, "an earlier run has left this part unfinished");
+        }
         Ok(folder)
     }
 
@@ -139,7 +143,7 @@ impl Folder {
     }
 
     fn parent(&self) -> &Path {
-        self.file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+        parent_of(&self.file)
     }
 
     /// The folder of the saves.
@@ -252,16 +256,28 @@ impl Files for Folder {
     }
 
     fn keep(&mut self, parts: &[u64], name: &str) -> io::Result<Vec<PathBuf>> {
+        let left = |part: &u64| {
+            let (finished, unfinished) = (self.finished(*part), self.path(*part));
+            // A part that is still written is whole as soon as it is closed: the link is the same file. One that the
+            // disk has refused stays unfinished.
+            match unfinished.exists() && !finished.exists() {
+                true if is_being_written(&unfinished) => (unfinished, finished),
+                true => (unfinished.clone(), unfinished),
+                false => (finished.clone(), finished),
+            }
+        };
+        let left: Vec<(PathBuf, PathBuf)> = parts.iter().map(left).filter(|(source, _)| source.exists()).collect();
+        if left.is_empty() {
+            return Err(io::Error::new(ErrorKind::NotFound, "the parts of that time are deleted"));
+        }
         let folder = self.saved().join(name);
-        fs::create_dir_all(&folder)?;
         let mut links = Vec::new();
-        for part in parts {
-            let finished = self.finished(*part);
-            let link = folder.join(finished.file_name().unwrap_or_default());
-            // A part that is still written is whole as soon as it is closed: the link is the same file.
-            let source = if finished.exists() { finished } else { self.path(*part) };
+        let failed = |error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", folder.display()));
+        fs::create_dir_all(&folder).map_err(failed)?;
+        for (source, name) in left {
+            let link = folder.join(name.file_name().unwrap_or_default());
             match fs::hard_link(&source, &link) {
-                Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error),
+                Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(failed(error)),
                 _ => links.push(link),
             }
         }
@@ -334,6 +350,11 @@ fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
     }
 }
 
+/// The folder of a file.
+fn parent_of(file: &Path) -> &Path {
+    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// `drive.mcap` with the infix `x` is `drive.x.mcap`.
 fn with_infix(file: &Path, infix: &str) -> PathBuf {
     let stem = file.file_stem().unwrap_or_default().to_string_lossy();
@@ -341,9 +362,14 @@ fn with_infix(file: &Path, infix: &str) -> PathBuf {
     file.with_file_name(format!("{stem}.{infix}.{extension}"))
 }
 
-/// True if a recording to `file` would meet a file of an earlier one.
+/// True if a recording to `file` would meet a file of an earlier one: its first part or, if that was deleted, another.
 fn is_taken(file: &Path) -> bool {
-    file.symlink_metadata().is_ok() || with_infix(file, "unfinished").exists()
+    let parts = with_infix(file, "part-").file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let name = |entry: io::Result<fs::DirEntry>| Some(entry.ok()?.file_name().to_string_lossy().into_owned());
+    let mut names = fs::read_dir(parent_of(file)).into_iter().flatten().filter_map(name);
+    file.symlink_metadata().is_ok()
+        || with_infix(file, "unfinished").exists()
+        || names.any(|name| name.starts_with(&parts) && is_part_of(file, Path::new(&name)))
 }
 
 /// True if `path` is named as a part of `file`, or of an earlier run that [`next_free_name`] has named.

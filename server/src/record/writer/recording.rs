@@ -187,6 +187,9 @@ impl<F: Files> RecordingWriter<F> {
                     error.to_string()
                 })?;
             }
+            Command::Start if self.parts.is_empty() => {
+                return Err(format!("the disk has failed, and the recorder tries again by itself: {}", self.reason));
+            }
             Command::Start => return Err("the recorder is not stopped".to_owned()),
             Command::Stop if self.is_stopped => return Err("the recorder is stopped already".to_owned()),
             Command::Stop => {
@@ -226,6 +229,10 @@ impl<F: Files> RecordingWriter<F> {
         let name = format!("{}-{reason}", since.as_millis());
         let links = self.files.keep(&parts, &name).map_err(|error| error.to_string())?;
         tracing::info!(reason, seconds, files = links.len(), "saved the last seconds of the recording");
+        if links.len() < parts.len() {
+            let deleted = parts.len() - links.len();
+            tracing::warn!(reason, seconds, deleted, "parts of the last seconds were deleted before they were saved");
+        }
         if self.parts.len() == 1 && !self.waits && !self.is_stopped {
             self.split(now)?;
         }
@@ -403,12 +410,19 @@ impl<F: Files> RecordingWriter<F> {
         if let Some(part) = self.parts.remove(index) {
             self.counts.move_to_dropped(&part.unsynced);
             part.file.abandon();
+            self.closed.push_back((number, now));
         }
         for vehicle in &mut self.vehicles {
             vehicle.part = vehicle.part.filter(|part| *part != number);
             vehicle.warm_up = vehicle.warm_up.filter(|part| *part != number);
         }
-        self.fail(&with_cause(error), now);
+        self.fail_part(number, error, now);
+    }
+
+    /// Notes that the disk refuses a part, of which what it has taken stays.
+    fn fail_part(&mut self, number: u64, error: &McapError, now: Instant) {
+        let left = self.files.path(number);
+        self.fail(&format!("{}; what was written before is in {}", with_cause(error), left.display()), now);
     }
 
     /// Notes a failure of the disk, and when to try again.
@@ -462,7 +476,7 @@ impl<F: Files> RecordingWriter<F> {
             }
             Err(error) => {
                 self.counts.move_to_dropped(&unsynced);
-                self.fail(&with_cause(&error), now);
+                self.fail_part(number, &error, now);
             }
         }
     }

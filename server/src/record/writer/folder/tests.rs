@@ -17,6 +17,11 @@ fn a_new_run_never_overwrites_an_earlier_recording() {
     }
     File::create(temporary.path().join("car-3.unfinished.mcap")).unwrap();
     assert_eq!(next_free_name(&file), temporary.path().join("car-4.mcap"));
+    // The first parts of a run are deleted before its last ones.
+    fs::remove_file(&file).unwrap();
+    fs::rename(temporary.path().join("car-1.mcap"), temporary.path().join("car.part-0007.mcap")).unwrap();
+    assert_eq!(next_free_name(&file), temporary.path().join("car-1.mcap"));
+    assert_eq!(folder(&file, false).unwrap_err().kind(), ErrorKind::AlreadyExists);
 }
 
 #[test]
@@ -52,6 +57,12 @@ fn old_parts_are_deleted_beyond_the_size_and_saved_ones_stay() {
     }
     let saved = parts.keep(&[1, 2], "fault").unwrap();
     parts.delete_old();
+    let late = parts.keep(&[2, 3], "late").unwrap();
+    assert_eq!(late, [at("saved/late/car.part-0003.mcap")], "part 2 is deleted");
+    assert!(parts.keep(&[1], "later").unwrap_err().to_string().contains("deleted"));
+    // A part that the disk has refused is saved as it is.
+    drop(parts.create(5).unwrap());
+    assert_eq!(parts.keep(&[5], "refused").unwrap(), [at("saved/refused/car.part-0005.unfinished.mcap")]);
     let left: Vec<bool> = (1..=4).map(|part| parts.finished(part).exists()).collect();
     assert_eq!(left, [false, false, true, true], "two parts of 400 KiB fit into 1 MiB");
     assert!(saved.len() == 2 && saved.iter().all(|link| link.metadata().unwrap().len() == 400 << 10));
