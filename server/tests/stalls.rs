@@ -124,6 +124,12 @@ async fn next_fresh(maps: &mut MapStream) -> MapView {
     .await
 }
 
+/// By how much the stamps of two maps differ from a whole number of revolutions.
+fn moved_ns(first: &MapView, second: &MapView) -> i64 {
+    let off_ns = (second.header().capture_end_ns - first.header().capture_end_ns).rem_euclid(REVOLUTION_NS);
+    off_ns.min(REVOLUTION_NS - off_ns)
+}
+
 /// Runs `clearway watch` to its end.
 async fn watch(arguments: Vec<String>) -> Output {
     let run = move || Command::new(env!("CARGO_BIN_EXE_clearway")).arg("watch").args(arguments).output().unwrap();
@@ -137,9 +143,13 @@ async fn after_a_stop_of_the_server_stamps_go_on_as_if_it_had_not_stopped() {
     let mut maps = within("a connection", server.subscribe()).await;
     let vehicle = Vehicle::driving_to(server.data, Pace::RealTime);
     let mut last = next_fresh(&mut maps).await;
+    // By how much stamps move against the revolutions while nothing stops: the sender may be late on a busy machine.
+    let mut busy_ns = 0;
     for stop_ms in [1000.0, 2000.0] {
         for _ in 0..8 {
-            last = next_fresh(&mut maps).await;
+            let next = next_fresh(&mut maps).await;
+            busy_ns = busy_ns.max(moved_ns(&last, &next));
+            last = next;
         }
         server.signal("-STOP");
         within("the age", async {
@@ -152,9 +162,8 @@ async fn after_a_stop_of_the_server_stamps_go_on_as_if_it_had_not_stopped() {
         let after = next_fresh(&mut maps).await;
         // The kernel has stamped the packets that waited: nothing had to be corrected, back or forth.
         assert_eq!(after.header().epoch, last.header().epoch);
-        let off_ns = (after.header().capture_end_ns - last.header().capture_end_ns).rem_euclid(REVOLUTION_NS);
-        let off_ns = off_ns.min(REVOLUTION_NS - off_ns);
-        assert!(off_ns < REVOLUTION_NS / 5, "the stamps moved by {off_ns} ns against the revolutions");
+        let (moved_ns, allowed_ns) = (moved_ns(&last, &after), REVOLUTION_NS / 5 + 2 * busy_ns);
+        assert!(moved_ns < allowed_ns, "the stamps moved by {moved_ns} ns against the revolutions, of {allowed_ns}");
         last = after;
     }
     drop(vehicle);

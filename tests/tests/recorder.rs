@@ -145,11 +145,13 @@ async fn a_recording_is_stopped_started_saved_and_listed() {
     assert!(listed.iter().any(|part| part.file.ends_with("car.mcap")), "{listed:?}");
     assert!(listed.iter().any(|part| part.is_unfinished), "{listed:?}");
     let address = running.grpc.expect("gRPC is served").to_string();
-    let json = async |request: &'static [&'static str]| {
+    let clearway = async |request: &'static [&'static str]| {
         let arguments = [&["recorder"], request, &["--json", "--server", &address]].concat().join(" ");
         let run = move || clearway_tests::run(Path::new("."), "clearway", &arguments.split(' ').collect::<Vec<_>>());
-        let output = tokio::task::spawn_blocking(run).await.unwrap();
-        serde_json::from_slice::<serde_json::Value>(&output.stdout).expect("JSON")
+        tokio::task::spawn_blocking(run).await.unwrap()
+    };
+    let json = async |request: &'static [&'static str]| {
+        serde_json::from_slice::<serde_json::Value>(&clearway(request).await.stdout).expect("JSON")
     };
     let [listed_as_json, told] = [json(&["list"]).await, json(&["status"]).await];
     assert_eq!(listed_as_json["parts"].as_array().unwrap().len(), listed.len(), "{listed_as_json}");
@@ -157,6 +159,9 @@ async fn a_recording_is_stopped_started_saved_and_listed() {
     assert_eq!((&told["state"], &told["saved"]), (&"recording".into(), &serde_json::json!([])), "{told}");
     assert_eq!(told["topics"].as_array().unwrap().len() as u64, 1 + fixture::LAYERS, "{told}");
     let part = service.status(v1::RecordingStatusRequest {}).await.unwrap().into_inner().status.unwrap().part;
+    let wrong = clearway(&["save", "--reason", "../x"]).await;
+    let told = String::from_utf8_lossy(&wrong.stderr).into_owned();
+    assert_eq!((wrong.status.code(), told.contains("1 to 40 letters")), (Some(3), true), "{told}");
     let saved = json(&["save", "--reason", "as-json"]).await;
     assert!(saved["saved"][0].as_str().unwrap().contains("as-json"), "{saved}");
     within("shutdown", running.shutdown()).await.unwrap();
@@ -184,6 +189,7 @@ async fn finished_parts_go_to_the_store_and_none_is_deleted_before_it_is_confirm
     }
     until("the first part waits", || recorder().store_waiting >= 1 && recorder().store_failures >= 2).await;
     assert!(recorder().store_problem.contains("away/store"), "{}", recorder().store_problem);
+    assert!(recorder().store_problem_since_ns > 0);
     assert_eq!(recorder().store_confirmed, 0);
     assert!(std::fs::metadata(recordings.join("car.mcap")).unwrap().len() > 1 << 20, "longer than keep_mb");
     until("the second part is whole", || finished("car.part-0002.mcap")).await;
@@ -309,6 +315,30 @@ async fn digests_in_place_of_maps_prove_the_same_and_events_alone_make_the_maps_
         output.status.code() == Some(1) && text.contains("cells changed") && !text.contains("only after"),
         "{text}"
     );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recorder_that_has_failed_has_an_exit_code_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let parts = folder.path().join("parts");
+    std::fs::create_dir(&parts).unwrap();
+    let running = live(&parts.join("car.mcap")).await;
+    let server = format!("http://{}", running.grpc.expect("gRPC is served"));
+    let recorder = |command: &str| {
+        let arguments = ["recorder", command, "--server", &server];
+        let output = clearway_tests::run(folder.path(), "clearway", &arguments);
+        (output.status.code(), String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned())
+    };
+    let (code, said) = recorder("status");
+    assert!(code == Some(0) && said.starts_with("recording "), "{code:?}: {said}");
+    std::fs::remove_dir_all(&parts).unwrap();
+    std::fs::write(&parts, "a file where the parts' folder should be").unwrap();
+    recorder("stop");
+    let (code, said) = recorder("start");
+    assert!(code != Some(0) && said.contains("parts"), "{code:?}: {said}");
+    let (code, said) = recorder("status");
+    assert!(code == Some(4) && said.contains("failed") && said.contains("part"), "{code:?}: {said}");
+    assert!(within("shutdown", running.shutdown()).await.is_err(), "the recording is incomplete");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -10,7 +10,8 @@ use clearway::server::{Server, Setup};
 use clearway_proto::v1;
 use clearway_sim::send::{Pace, Until, drive};
 use fixture::{
-    config, feed, frame, grpc, readings, recorded, selection, sequence, start, until, vehicle, web_socket, within,
+    PING, config, feed, frame, grpc, pong, readings, recorded, selection, sequence, start, until, vehicle, web_socket,
+    within,
 };
 use tokio::net::UdpSocket;
 use tokio::sync::mpsc;
@@ -311,11 +312,13 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
     let vehicles: serde_json::Value = serde_json::from_str(body).unwrap();
     assert_eq!(vehicles[0]["name"], "car");
 
+    use tokio::io::AsyncWriteExt;
     let mut stream = web_socket(address, "/live?vehicle=car").await;
     let (mut update, mut status) = (None, None);
     within("a map and a status", async {
         while update.is_none() || status.is_none() {
-            match frame(&mut stream).await {
+            match frame(&mut stream).await.unwrap() {
+                (PING, says) => stream.write_all(&pong(&says)).await.unwrap(),
                 (2, payload) => update = Some(<v1::MapUpdate as prost::Message>::decode(&payload[..]).unwrap()),
                 (1, payload) => status = Some(serde_json::from_slice::<serde_json::Value>(&payload).unwrap()),
                 other => panic!("{other:?}"),

@@ -10,7 +10,8 @@ use super::error::ValueError;
 pub struct Store {
     /// A folder, also as `file:///FOLDER`, or `s3://BUCKET/PREFIX`; empty: parts stay where they are.
     pub url: String,
-    /// True if each part is deleted from the recorder's folder after the store has confirmed it.
+    /// True if each part is deleted from the recorder's folder after the store has confirmed it, once it is older than
+    /// `recorder.save_s`.
     pub delete: bool,
 }
 

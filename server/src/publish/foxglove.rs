@@ -29,7 +29,7 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 
 use super::listen::access::Caller;
-use super::listen::{InProgress, Listener, Place};
+use super::listen::{InProgress, Listener, Place, READ_BUFFER_BYTES};
 use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
 use crate::encode::EncodedMap;
@@ -278,7 +278,7 @@ async fn connect(
     Extension(place): Extension<Arc<Place>>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    let upgrade = upgrade.protocols([PROTOCOL]).max_message_size(MESSAGE_BYTES_MAX);
+    let upgrade = upgrade.protocols([PROTOCOL]).max_message_size(MESSAGE_BYTES_MAX).read_buffer_size(READ_BUFFER_BYTES);
     if upgrade.selected_protocol().is_none() {
         return (StatusCode::BAD_REQUEST, format!("the protocol {PROTOCOL} is needed\n")).into_response();
     }

@@ -14,7 +14,7 @@ use rust_embed::RustEmbed;
 use serde_json::Value;
 
 use super::listen::access::Caller;
-use super::listen::{Listener, ListenerHandle, Place};
+use super::listen::{Listener, ListenerHandle, Place, READ_BUFFER_BYTES};
 pub use super::page_live::Summaries;
 use super::page_live::{Live, MESSAGE_BYTES_MAX};
 use super::page_recorder::PageRecorder;
@@ -150,6 +150,6 @@ async fn live(
         },
     };
     let in_progress = place.begin_request();
-    let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX);
+    let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX).read_buffer_size(READ_BUFFER_BYTES);
     upgrade.on_upgrade(move |socket| live.serve(socket, in_progress))
 }

@@ -13,9 +13,14 @@
 //!
 //! A selection means what it means over gRPC. With `max_in_flight`, no more maps than that are on the way, so a slow
 //! link has no backlog. A connection of one vehicle, `/live?vehicle=V`, begins with all its layers, and its status is a
-//! `status` message. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
+//! `status` message.
+//!
+//! The server sends a ping once a second, and the status with the answer, which a browser gives by itself. While an
+//! answer is late nothing else is sent: a peer that does not read costs a ping. One that has not answered for
+//! [`PONG_TIMEOUT`], or takes no byte for [`SEND_TIMEOUT`], is disconnected.
 
 use std::collections::BTreeMap;
+use std::hash::{BuildHasher, RandomState};
 use std::pin::Pin;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -46,7 +51,9 @@ use crate::status::vehicle_json;
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time between two status messages.
+/// Longest time until a browser answers a ping. Ours: a link may need seconds for the maps that are on the way.
+const PONG_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time between two pings, and so between two status messages; an answer that takes longer is late.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
 /// Longest message from a browser, in bytes. Ours: the page sends pongs and short requests.
 pub(super) const MESSAGE_BYTES_MAX: usize = 4096;
@@ -98,7 +105,47 @@ impl Drop for Watching {
 /// A map, or the end of a vehicle's maps, with the vehicle's name and the id of its selection.
 type Update = (String, u64, Result<v1::MapUpdate, Status>);
 
+/// Whether the browser reads: the pings it was sent, and its answers.
+#[derive(Default)]
+struct Pings {
+    /// Keys that the browser does not know: it can answer only what it has read.
+    keys: RandomState,
+    count: u64,
+    has_answered: bool,
+    /// The ping that is not answered yet: what it says, and since when.
+    unanswered: Option<([u8; 8], Instant)>,
+}
+
+impl Pings {
+    /// True if more may be sent.
+    fn allow_more(&self) -> bool {
+        self.has_answered && self.unanswered.is_none_or(|(_, since)| since.elapsed() < STATUS_PERIOD)
+    }
+
+    /// The next ping, unless one waits for its answer.
+    fn next(&mut self) -> Next {
+        match self.unanswered {
+            Some((_, since)) if since.elapsed() >= PONG_TIMEOUT => Next::End,
+            Some(_) => Next::Nothing,
+            None => {
+                self.count += 1;
+                let says = self.keys.hash_one(self.count).to_be_bytes();
+                self.unanswered = Some((says, Instant::now()));
+                Next::Frame(Frame::Ping(Bytes::copy_from_slice(&says)))
+            }
+        }
+    }
+
+    /// Returns true if this answers the ping that waits.
+    fn answer(&mut self, pong: &[u8]) -> bool {
+        let is_answer = self.unanswered.take_if(|(says, _)| pong == says).is_some();
+        self.has_answered |= is_answer;
+        is_answer
+    }
+}
+
 /// What a connection sends next.
+#[derive(Debug)]
 enum Next {
     Frame(Frame),
     Nothing,
@@ -212,16 +259,19 @@ impl Live {
         }
         let mut replay_state = self.replay.as_ref().map(|replay| replay.handle.state());
         replay_state.iter_mut().for_each(watch::Receiver::mark_changed);
+        let mut pings = Pings::default();
         loop {
+            let may_send = pings.allow_more();
             let next = tokio::select! {
-                Some(update) = self.updates.next(), if !self.updates.is_empty() => self.send(update),
-                _ = every.tick() => self.status(),
-                points = next_points(&mut self.points) => Next::Frame(Frame::Binary(points)),
-                state = replay_changed(&mut replay_state) => text(replay_json(&state, "")),
+                Some(update) = self.updates.next(), if may_send && !self.updates.is_empty() => self.send(update),
+                _ = every.tick() => pings.next(),
+                points = next_points(&mut self.points), if may_send => Next::Frame(Frame::Binary(points)),
+                state = replay_changed(&mut replay_state), if may_send => text(replay_json(&state, "")),
                 answer = replay_answered(&mut self.replay) => text(answer),
                 answer = recorder_answered(&mut self.recorder) => text(answer),
                 received = socket.recv() => match received {
                     Some(Ok(Frame::Text(text))) => self.apply(&text),
+                    Some(Ok(Frame::Pong(pong))) if pings.answer(&pong) => self.status(),
                     // The library answers pings.
                     Some(Ok(_)) => Next::Nothing,
                     Some(Err(_)) | None => Next::End,
@@ -389,6 +439,24 @@ fn refused(vehicle: &str, id: u64, reason: &str) -> Next {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn nothing_is_sent_before_a_ping_is_answered_with_what_it_said() {
+        let mut pings = Pings::default();
+        assert!(!pings.allow_more() && !pings.answer(&[]));
+        let Next::Frame(Frame::Ping(says)) = pings.next() else { panic!("a ping is first") };
+        assert!(!pings.answer(b"a guess!") && !pings.allow_more());
+        assert!(matches!(pings.next(), Next::Nothing), "one ping waits at a time");
+        assert!(pings.answer(&says) && pings.allow_more());
+        assert!(!pings.answer(&says), "an answer counts once");
+        let Next::Frame(Frame::Ping(other)) = pings.next() else { panic!("the next ping is due") };
+        assert!(says != other && pings.allow_more());
+        pings.unanswered = pings.unanswered.map(|(says, since)| (says, since - STATUS_PERIOD));
+        assert!(!pings.allow_more(), "the answer is late");
+        assert!(matches!(pings.next(), Next::Nothing));
+        pings.unanswered = pings.unanswered.map(|(says, since)| (says, since - PONG_TIMEOUT));
+        assert!(matches!(pings.next(), Next::End));
+    }
 
     #[test]
     fn a_request_of_a_browser_is_read_whole_or_refused() {

@@ -198,7 +198,9 @@ impl Running {
             let (recorder, of_vehicles) = Recorder::start(&options, &header(), driver.from_files)?;
             #[cfg(feature = "store")]
             if options.awaits_store {
-                let uploads = uploads::upload_finished(config.store.clone(), recorder.control(), recorder.counts());
+                let saved = Duration::from_secs(config.recorder.save_s);
+                let (control, counts) = (recorder.control(), recorder.counts());
+                let uploads = uploads::upload_finished(config.store.clone(), saved, control.clone(), counts);
                 let (stopped, runtime) = (self.stopped(), tokio::runtime::Handle::current());
                 // What the store has not confirmed at the end stays, and the next start sends it. On a thread of its
                 // own, because it reads whole files.
@@ -207,6 +209,7 @@ impl Running {
                         () = uploads => {}
                         () = stopped => {}
                     }
+                    uploads::log_unconfirmed(&control);
                 };
                 self.publishers.spawn(async move {
                     // Fails only if the runtime shuts down.

@@ -131,6 +131,7 @@ impl VehicleStatus {
             sensors: changing.sensors.iter().map(|sensor| sensor_facts(sensor, &changing, up)).collect(),
             loss,
             recorder_problem: self.recorder_problem(),
+            store_problem: self.recorder.get().and_then(|counts| counts.store_problem()),
             claimed_by,
         }
     }

@@ -75,6 +75,8 @@ pub struct Facts {
     pub loss: f64,
     /// What is wrong with the recording.
     pub recorder_problem: Option<String>,
+    /// What is wrong with the long-term store.
+    pub store_problem: Option<String>,
     /// Other servers that serve a vehicle of the same name.
     pub claimed_by: Vec<String>,
 }
@@ -173,6 +175,9 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
     }
     if let Some(problem) = &facts.recorder_problem {
         add(State::Warn, format!("recorder: {problem}"));
+    }
+    if let Some(problem) = &facts.store_problem {
+        add(State::Warn, problem.clone());
     }
     for server in &facts.claimed_by {
         add(State::Warn, format!("server {server} serves a vehicle of the same name"));
@@ -330,7 +335,7 @@ mod tests {
     #[test]
     fn each_thing_that_is_wrong_has_its_words() {
         type Change = fn(&mut Facts);
-        let cases: [(&str, &str, Change); 16] = [
+        let cases: [(&str, &str, Change); 17] = [
             ("error", "the engine has hung for 4 s", |f| f.fault = Some("the engine has hung for 4 s".into())),
             ("warn", "no packets from rear for 76 s", |f| f.sensors[1].silent = Some(ms(76_000))),
             ("warn", "no packets from rear since the server started 60 s ago", |f| f.sensors[1].silent = None),
@@ -356,6 +361,9 @@ mod tests {
             ("warn", "top covers 72 % of its revolution", |f| f.sensors[0].completeness = Some(0.72)),
             ("warn", "the clock of top is holdover", |f| f.sensors[0].clock = "holdover".into()),
             ("warn", "4.2 % of the packets of the last 10 s were lost or refused", |f| f.loss = 0.042),
+            ("warn", "1 part not yet in the store: no", |f| {
+                f.store_problem = Some("1 part not yet in the store: no".into())
+            }),
             ("warn", "recorder: the disk is too slow", |f| f.recorder_problem = Some("the disk is too slow".into())),
             ("warn", "server b serves a vehicle of the same name", |f| f.claimed_by = vec!["b".into()]),
         ];

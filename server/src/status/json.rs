@@ -49,6 +49,7 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
         }),
         "speed_m_s": vehicle.speed_m_s,
         "map_age_ms": vehicle.map_age_ms,
+        "map_valid_ms": vehicle.map_valid_ms,
         "map_rate_hz": vehicle.map_rate_hz,
         "loss": vehicle.loss,
         "latency_ms": vehicle.latency_ms,
@@ -73,6 +74,7 @@ pub fn recorder_json(recorder: &v1::RecorderStatus) -> Value {
         "store": {
             "confirmed": recorder.store_confirmed, "waiting": recorder.store_waiting,
             "failures": recorder.store_failures, "problem": recorder.store_problem,
+            "problem_since_ns": recorder.store_problem_since_ns,
         },
         "topics": recorder.topics.iter().map(|of| {
             json!({"topic": of.topic, "offered": of.offered, "written": of.written, "dropped": of.dropped})

@@ -23,9 +23,9 @@ impl VehicleStatus {
 
     fn proto_of(&self, snapshot: &Snapshot) -> v1::Vehicle {
         let assessment = self.assess();
-        let (sensors, pose) = {
+        let (sensors, pose, validity) = {
             let changing = locked(&self.changing);
-            (changing.states.clone(), changing.pose)
+            (changing.states.clone(), changing.pose, changing.validity)
         };
         v1::Vehicle {
             name: self.name.to_string(),
@@ -48,6 +48,7 @@ impl VehicleStatus {
             pose,
             speed_m_s: assessment.speed_m_s,
             map_age_ms: assessment.map_age_ms,
+            map_valid_ms: validity.as_secs_f64() * 1e3,
             map_rate_hz: snapshot.map_rate_hz,
             loss: assessment.loss,
             latency_ms: snapshot.latency_ms.iter().map(|(&stage, &ms)| (stage.to_owned(), ms)).collect(),

@@ -251,13 +251,18 @@ impl Families<'_, '_> {
             Some(of.status.recorder.get()?.durable_events(&of.status.name) as f64)
         })?;
         // All vehicles share one recorder.
-        let recorder = self.all.iter().find_map(|of| of.status.recorder.get());
-        let file = recorder.map(|counts| counts.to_proto().file).filter(|file| !file.is_empty());
-        let Some(file) = file else { return Ok(()) };
-        let bytes = fs::metadata(&file).ok().map(|file| file.len() as f64);
+        let Some(counts) = self.all.iter().find_map(|of| of.status.recorder.get()) else { return Ok(()) };
+        let (recorder, folder) = (counts.to_proto(), counts.folder());
+        let help = "Parts that the long-term store has confirmed.";
+        self.single("clearway_store_confirmed_parts_total", help, Some(recorder.store_confirmed as f64))?;
+        let help = "Finished parts that wait for the long-term store.";
+        self.single("clearway_store_waiting_parts", help, Some(recorder.store_waiting as f64))?;
+        let help = "Attempts to store a part that failed.";
+        self.single("clearway_store_failures_total", help, Some(recorder.store_failures as f64))?;
+        let bytes = fs::metadata(&recorder.file).ok().map(|file| file.len() as f64);
         self.single("clearway_recorder_file_bytes", "Length of the part that is being written.", bytes)?;
-        let folder = Path::new(&file).parent().filter(|folder| !folder.as_os_str().is_empty());
-        let disk = nix::sys::statvfs::statvfs(folder.unwrap_or(Path::new("."))).ok();
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { &folder };
+        let disk = nix::sys::statvfs::statvfs(folder).ok();
         let free = disk.map(|disk| disk.blocks_available() as f64 * disk.fragment_size() as f64);
         self.single("clearway_recorder_free_bytes", "Free space on the disk of the recording.", free)
     }

@@ -11,8 +11,6 @@ const MAP_HZ = 1, MAP_RADIUS_M = 30, MAP_PX = 150, SCALE_MAX = 2;
 // Cards change places this often at most, so that they can be read and clicked.
 const ORDER_EVERY_MS = 3000;
 const SIGHT_MARGIN = "100px";
-// Validity of a map of which only the age is known. Ours: three revolutions of a slow sensor.
-const VALIDITY_MS = 500;
 
 const keyOf = (status) => status.key ?? status.name;
 const $ = (id) => document.getElementById(id);
@@ -160,7 +158,7 @@ export class FleetView {
     const { status, frame, parts, element } = card;
     const shown = frame && freshness(frame.header, this.#clock.now_ns(now_ms));
     card.age_ms = ageOf(status, now_ms - card.status_arrived_ms, shown?.age_ms);
-    card.fresh = freshOf(card.age_ms, shown?.validity_ms ?? VALIDITY_MS);
+    card.fresh = freshOf(card.age_ms, shown?.validity_ms ?? status.map_valid_ms);
     card.speed = status.speed_m_s ?? frame?.header.speed_mps ?? null;
     const { state, reasons } = stateOf(status);
     element.dataset.fresh = card.fresh;

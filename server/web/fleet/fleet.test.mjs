@@ -13,15 +13,16 @@ test("a state that the server does not send, or that is unknown, is not shown", 
   assert.deepEqual(stateOf({ claimed_by: ["b:50051"] }).reasons, ["also claimed by b:50051"]);
 });
 
-test("the age of a vehicle's maps is that of the newest one known of, and grows", () => {
+test("the age of a vehicle's maps is that of the newest one told of, and grows when there is no news", () => {
   assert.equal(ageOf({}, 100, null), null);
-  assert.equal(ageOf({ map_age_ms: 200 }, 700, null), 900);
-  assert.equal(ageOf({ map_age_ms: 200 }, 700, 400), 400);
+  assert.equal(ageOf({ map_age_ms: 200 }, 700, null), 200);
+  assert.equal(ageOf({ map_age_ms: 200 }, 3700, null), 3900);
+  assert.equal(ageOf({ map_age_ms: 200 }, 700, 40), 40);
   assert.equal(ageOf({ map_age_ms: null }, 700, 1400), 1400);
 });
 
-test("a card that gets a map a second is fresh, and stale without one", () => {
-  assert.deepEqual([freshOf(null, 300), freshOf(1200, 300), freshOf(2801, 300)], ["none", "fresh", "stale"]);
+test("a map is fresh until its validity has passed", () => {
+  assert.deepEqual([freshOf(null, 300), freshOf(300, 300), freshOf(301, 300)], ["none", "fresh", "stale"]);
 });
 
 const card = (name, more = {}, fresh = "fresh", age_ms = 100) =>

@@ -1,7 +1,7 @@
 // What a vehicle's status says, in the words of the fleet. Pure. A field that the server does not send is not shown.
 
 const ORDER = { error: 0, warn: 1, ok: 2 };
-// A status is a second old at most, and so is the map that it tells of. A vehicle without news for longer is silent.
+// A status arrives once a second. A vehicle without news for longer is silent.
 const NEWS_MS = 2500;
 
 // A vehicle of another server, as that server says it. Two servers may claim one name: its card has a key of its own.
@@ -24,17 +24,17 @@ export function stateOf(status) {
   return { state, reasons: [...served, ...(status?.reasons ?? []), ...claimed] };
 }
 
-// The age of the newest map that is known of, in ms; null if none is known. status_age_ms: since the status arrived.
-// frame_age_ms: age of the map on the card, null without one.
+// The age of the newest map, in ms, when it was last told: by the status, which arrived status_age_ms ago, or by the map
+// on the card, frame_age_ms old. Without news for longer it grows. null if no map is known.
 export function ageOf(status, status_age_ms, frame_age_ms) {
-  const by_status = status.map_age_ms == null ? Infinity : status.map_age_ms + status_age_ms;
+  const silent_ms = status_age_ms > NEWS_MS ? status_age_ms : 0;
+  const by_status = status.map_age_ms == null ? Infinity : status.map_age_ms + silent_ms;
   const age = Math.min(by_status, frame_age_ms ?? Infinity);
   return Number.isFinite(age) ? age : null;
 }
 
-// "fresh", "stale" or "none". A card gets a map a second, so this much is allowed over the validity.
-export const freshOf = (age_ms, validity_ms) =>
-  age_ms === null ? "none" : age_ms <= validity_ms + NEWS_MS ? "fresh" : "stale";
+// "fresh", "stale" or "none".
+export const freshOf = (age_ms, validity_ms) => (age_ms === null ? "none" : age_ms <= validity_ms ? "fresh" : "stale");
 
 // A vehicle that is not well: its state says so, or its maps are old.
 export const needsCare = ({ status, fresh }) =>

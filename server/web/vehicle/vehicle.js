@@ -242,7 +242,7 @@ export class VehicleView {
     setText($("heading"), pose ? `${(Math.round((yawOf(pose) * 180) / Math.PI) + 360) % 360}°` : "");
     const { state, reasons } = stateOf(status);
     $("state").hidden = !state;
-    $("state").dataset.state = state ?? "";
+    for (const part of ["state", "reasons"]) $(part).dataset.state = state ?? "";
     setText($("state"), state ? state.toUpperCase() : "");
     $("reasons").hidden = reasons.length === 0;
     setText($("reasons"), reasons.join(" · "));

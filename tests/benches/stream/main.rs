@@ -1,6 +1,6 @@
 //! Measures the cost of the stream: a server in its own process, a simulated HDL-64E that sends datagrams to it in real
-//! time, and readers of one layer over gRPC, over zenoh, and over plain TCP, which is the lower bound for the same
-//! bytes.
+//! time, and readers of one layer over gRPC, over zenoh, over the page's WebSocket, and over plain TCP, which is the
+//! lower bound for the same bytes.
 //!
 //!   cargo bench -p clearway-tests --bench stream                                  1, 10, 100 and 1,000 readers
 //!   cargo bench -p clearway-tests --bench stream -- --readers 1,10 --seconds 30 --layer occupancy --json
@@ -8,7 +8,7 @@
 //!
 //! Age: time from sending the last packet of a revolution to receiving its map. Carried: time from the server's
 //! hand-over to the transport to receiving the map. The first reader decodes every map, as a planner does; the others
-//! receive the bytes, and acknowledge them over gRPC. Memory: growth of the server's resident set, divided by the
+//! receive the bytes, and acknowledge them over gRPC and to the page. Memory: growth of the server's resident set, divided by the
 //! number of readers. All processes use the clock of one machine.
 
 mod drive;
@@ -24,9 +24,13 @@ use bytes::Bytes;
 use clap::Parser;
 use clearway_client::{MapView, now_ns, v1};
 use clearway_proto::v1::map_service_client::MapServiceClient;
+use futures::{SinkExt, StreamExt};
 use serde_json::json;
 use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
 use tokio::task::JoinSet;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::{WebSocketStream, client_async};
 use tonic::transport::{Channel, Endpoint};
 
 use drive::{Car, Cuts, Revolutions, cast};
@@ -71,6 +75,7 @@ enum Carrier {
     Tcp,
     Grpc,
     Zenoh,
+    Page,
 }
 
 /// Measurements of all readers together.
@@ -126,7 +131,7 @@ fn main() -> ExitCode {
     for &readers in &arguments.readers {
         let mut bytes = 10_000;
         // TCP is last, with as many bytes as a map has.
-        for carrier in [Carrier::Grpc, Carrier::Zenoh, Carrier::Tcp] {
+        for carrier in [Carrier::Grpc, Carrier::Zenoh, Carrier::Page, Carrier::Tcp] {
             let row = runtime.block_on(measure(&arguments, &revolutions, carrier, readers, bytes));
             bytes = row["bytes_per_map"].as_u64().unwrap_or(bytes);
             if !arguments.json {
@@ -225,7 +230,7 @@ impl Readers {
         match carrier {
             Carrier::Tcp => {
                 for _ in 0..count {
-                    let stream = tokio::net::TcpStream::connect(server.floor).await.expect("the floor answers");
+                    let stream = TcpStream::connect(server.floor).await.expect("the floor answers");
                     tasks.spawn(self.clone().over_tcp(stream, bytes as usize));
                 }
             }
@@ -246,6 +251,15 @@ impl Readers {
                         tasks.spawn(self.clone().over_grpc(service, layer.to_owned(), is_first));
                     }
                     left -= streams.min(left);
+                }
+            }
+            Carrier::Page => {
+                for _ in 0..count {
+                    let stream = TcpStream::connect(server.page).await.expect("the page answers");
+                    stream.set_nodelay(true).expect("an option");
+                    let (socket, _) =
+                        client_async(format!("ws://{}/live", server.page), stream).await.expect("a WebSocket");
+                    tasks.spawn(self.clone().over_page(socket, layer.to_owned(), is_first));
                 }
             }
             Carrier::Zenoh => {
@@ -286,6 +300,27 @@ impl Readers {
         }
     }
 
+    async fn over_page(self, mut socket: WebSocketStream<TcpStream>, layer: String, is_planner: bool) {
+        use prost::Message as _;
+        let watch =
+            json!({ "type": "watch", "vehicle": "car", "id": 1, "layers": [layer], "max_in_flight": 2 }).to_string();
+        socket.send(Message::text(watch)).await.expect("the page takes it");
+        // The library answers pings.
+        while let Some(Ok(message)) = socket.next().await {
+            let arrived_ns = now_ns();
+            let Message::Binary(update) = message else { continue };
+            let update = v1::MapUpdate::decode(update).expect("an update");
+            let sequence = self.count_map(&update.map, update.sent_ns, arrived_ns, is_planner);
+            if self.counts.load(Ordering::Relaxed) {
+                self.seen.lock().expect("no thread panics").skipped += update.skipped;
+            }
+            let drawn = json!({ "type": "acknowledge", "vehicle": "car", "id": 1, "sequence": sequence.to_string() });
+            if socket.send(Message::text(drawn.to_string())).await.is_err() {
+                return;
+            }
+        }
+    }
+
     async fn over_zenoh(self, session: zenoh::Session, layer: String, is_planner: bool) {
         let key = format!("clearway/car/map/{layer}");
         let subscriber = session.declare_subscriber(key).await.expect("a subscriber");
@@ -302,7 +337,7 @@ impl Readers {
     }
 
     /// Requests messages of this many bytes; the first eight are the time by the server's clock.
-    async fn over_tcp(self, mut stream: tokio::net::TcpStream, bytes: usize) {
+    async fn over_tcp(self, mut stream: TcpStream, bytes: usize) {
         use tokio::io::AsyncWriteExt;
         stream.set_nodelay(true).expect("an option");
         stream.write_all(&(bytes as u64).to_le_bytes()).await.expect("the floor takes it");

@@ -12,11 +12,15 @@ use clearway_client::now_ns;
 use clearway_sim::scanner::ScannerConfig;
 use tokio::io::AsyncReadExt;
 
+/// Most browsers of a row.
+const BROWSERS_MAX: usize = 2048;
+
 /// The server's process and its addresses.
 pub struct Process {
     child: Child,
     pub data: SocketAddr,
     pub grpc: SocketAddr,
+    pub page: SocketAddr,
     pub floor: SocketAddr,
     pub zenoh: String,
 }
@@ -29,9 +33,9 @@ impl Process {
         let mut line = String::new();
         BufReader::new(child.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
         let places: Vec<&str> = line.split_whitespace().collect();
-        let [data, grpc, floor, zenoh] = places[..] else { panic!("the server prints {line:?}") };
+        let [data, grpc, page, floor, zenoh] = places[..] else { panic!("the server prints {line:?}") };
         let at = |address: &str| address.parse().expect("an address");
-        Self { data: at(data), grpc: at(grpc), floor: at(floor), zenoh: zenoh.into(), child }
+        Self { data: at(data), grpc: at(grpc), page: at(page), floor: at(floor), zenoh: zenoh.into(), child }
     }
 
     /// Resident set of the process, in KiB.
@@ -53,7 +57,9 @@ pub async fn serve() {
     let mut config = Config::of_one_vehicle("car", "top");
     let any: SocketAddr = "127.0.0.1:0".parse().expect("an address");
     config.grpc.listen = any;
-    config.page.enabled = false;
+    (config.page.enabled, config.page.listen, config.page.connections_max) = (true, any, BROWSERS_MAX);
+    (config.connections.per_address_max, config.connections.kept) = (BROWSERS_MAX, 0);
+    (config.connections.calls_max, config.connections.calls_per_address_max) = (BROWSERS_MAX, BROWSERS_MAX);
     config.zenoh.enabled = true;
     config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
     let vehicle = &mut config.vehicles[0];
@@ -67,7 +73,8 @@ pub async fn serve() {
     let floor_at = floor.local_addr().expect("bound");
     tokio::spawn(serve_floor(floor));
     let zenoh = running.zenoh.iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
-    println!("{data} {} {floor_at} {zenoh}", running.grpc.expect("gRPC is served"));
+    let [grpc, page] = [running.grpc, running.page].map(|address| address.expect("it is served"));
+    println!("{data} {grpc} {page} {floor_at} {zenoh}");
     let ended = tokio::task::spawn_blocking(|| std::io::copy(&mut std::io::stdin(), &mut std::io::sink()));
     ended.await.expect("no panic").expect("standard input");
 }

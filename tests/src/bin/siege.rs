@@ -2,9 +2,10 @@
 //!
 //!   cargo run --release -p clearway-tests --bin siege -- --minutes 10
 //!
-//! Columns: a healthy gRPC reader's 99th percentile and worst age of its maps, the maps it missed, and how often its
-//! stream broke; the same of a healthy zenoh reader, with the messages it passed over; the time until a new gRPC client
-//! has its first map (`-`: none in 5 s); the server's resident memory before, at most during, and 5 s after.
+//! Columns: a healthy gRPC reader of all layers: the 99th percentile and worst age of its maps, the maps it missed, and
+//! how often its stream broke; the same of a healthy zenoh reader of one layer, with the messages it passed over; the
+//! time until a new gRPC client has its first map (`-`: none in 5 s); the server's resident memory before, at most
+//! during, and 5 s after. TCP attacks come from 127.0.0.2, the honest peers from 127.0.0.1: limits are by address.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::PathBuf;

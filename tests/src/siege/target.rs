@@ -1,8 +1,12 @@
 //! The server under attack, and one attack.
 
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 
 use futures::future::BoxFuture;
+use tokio::net::{TcpSocket, TcpStream};
+
+/// The address that TCP attacks come from: another one than that of the honest peers, because limits are by address.
+const ATTACKER: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
 /// Where the server under attack listens.
 #[derive(Clone, Debug)]
@@ -24,4 +28,14 @@ pub struct Attack {
     pub name: &'static str,
     /// Runs it.
     pub run: fn(Target) -> BoxFuture<'static, ()>,
+}
+
+/// A connection of an attacker.
+///
+/// # Errors
+/// As of the socket.
+pub async fn connect(at: SocketAddr) -> std::io::Result<TcpStream> {
+    let socket = TcpSocket::new_v4()?;
+    socket.bind((ATTACKER, 0).into())?;
+    socket.connect(at).await
 }

@@ -72,8 +72,8 @@ async fn subscribe(target: &Target, over_zenoh: bool) -> Result<MapStream, Clien
     if over_zenoh {
         return ZenohClient::connect(&target.zenoh).await?.subscribe("car", "drivability").await;
     }
-    let subscription = Subscription { layers: vec!["drivability".into()], ..Subscription::default() };
-    Client::connect(&target.grpc.to_string()).await?.subscribe(subscription).await
+    // All layers, so that an attacker who asks for more layers costs the engine nothing that is not made anyway.
+    Client::connect(&target.grpc.to_string()).await?.subscribe(Subscription::default()).await
 }
 
 async fn read(target: &Target, over_zenoh: bool, seen: &Mutex<Seen>, stop: &AtomicBool) {

@@ -8,13 +8,17 @@ use prost::Message;
 use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
 use super::bad::Link;
-use super::fixture::{config, feed, frame, grpc, sequence, start, until, web_socket, within};
+use super::fixture::{PING, config, feed, frame, grpc, pong, sequence, start, until, web_socket, within};
 use super::{LAYER, portions};
 
-/// A browser's WebSocket.
-struct Browser(TcpStream);
+/// A browser's WebSocket: it reads and answers pings by itself, whatever the page does.
+struct Browser {
+    said: UnboundedSender<Vec<u8>>,
+    frames: UnboundedReceiver<(u8, Vec<u8>)>,
+}
 
 /// What a browser receives.
 enum Received {
@@ -23,17 +27,43 @@ enum Received {
 }
 
 impl Browser {
+    fn new(socket: TcpStream) -> Self {
+        let (mut reads, mut writes) = socket.into_split();
+        let (said, mut to_say) = unbounded_channel::<Vec<u8>>();
+        let (received, frames) = unbounded_channel();
+        tokio::spawn(async move {
+            while let Some(bytes) = to_say.recv().await {
+                if writes.write_all(&bytes).await.is_err() {
+                    break;
+                }
+            }
+        });
+        let answers = said.downgrade();
+        tokio::spawn(async move {
+            while let Ok((opcode, payload)) = frame(&mut reads).await {
+                let taken = match (opcode, answers.upgrade()) {
+                    (PING, Some(answers)) => answers.send(pong(&payload)).is_ok(),
+                    (PING, None) => false,
+                    other => received.send((other.0, payload)).is_ok(),
+                };
+                if !taken {
+                    break;
+                }
+            }
+        });
+        Self { said, frames }
+    }
+
     /// Watches one layer as the page does: at most two maps are on the way.
     async fn open(address: SocketAddr) -> Self {
-        let mut browser = Self(web_socket(address, "/live").await);
-        let watch = format!(r#"{{"type":"watch","vehicle":"car","id":1,"layers":["{LAYER}"],"max_in_flight":2}}"#);
-        browser.say(&watch).await;
+        let mut browser = Self::new(web_socket(address, "/live").await);
+        browser.say(&format!(r#"{{"type":"watch","vehicle":"car","id":1,"layers":["{LAYER}"],"max_in_flight":2}}"#));
         browser.text_of("watching").await;
         browser
     }
 
     /// Sends a text in a frame that is masked with zeros.
-    async fn say(&mut self, text: &str) {
+    fn say(&self, text: &str) {
         let length = u8::try_from(text.len()).unwrap();
         let mut bytes = vec![0x81];
         match length {
@@ -42,18 +72,17 @@ impl Browser {
         }
         bytes.extend([0; 4]);
         bytes.extend(text.as_bytes());
-        self.0.write_all(&bytes).await.unwrap();
+        self.said.send(bytes).expect("the connection is open");
     }
 
-    async fn acknowledge(&mut self, sequence: u64) {
-        let text = format!(r#"{{"type":"acknowledge","vehicle":"car","id":1,"sequence":"{sequence}"}}"#);
-        self.say(&text).await;
+    fn acknowledge(&self, sequence: u64) {
+        self.say(&format!(r#"{{"type":"acknowledge","vehicle":"car","id":1,"sequence":"{sequence}"}}"#));
     }
 
     async fn next(&mut self) -> Received {
-        match within("a frame", frame(&mut self.0)).await {
-            (1, text) => Received::Text(serde_json::from_slice(&text).unwrap()),
-            (2, update) => Received::Map(v1::MapUpdate::decode(&update[..]).unwrap()),
+        match within("a frame", self.frames.recv()).await {
+            Some((1, text)) => Received::Text(serde_json::from_slice(&text).unwrap()),
+            Some((2, update)) => Received::Map(v1::MapUpdate::decode(&update[..]).unwrap()),
             other => panic!("{other:?}"),
         }
     }
@@ -93,14 +122,15 @@ async fn a_browser_on_a_slow_link_gets_the_newest_map_and_never_a_backlog() {
     while made < 2 {
         made = feed(&running, portions.next().unwrap()).await;
     }
-    // The link passes nothing of the next revolutions: two maps are on the way, and no more are sent after them.
+    // The link passes nothing of the next revolutions: at most two maps are on the way, and no more are sent after them.
     while made < 20 {
         made = feed(&running, portions.next().unwrap()).await;
     }
     link.allowed.add_permits(1 << 20);
     let on_the_way = [browser.map().await, browser.map().await];
-    assert!(on_the_way.iter().all(|(sequence, _)| *sequence < 4), "{on_the_way:?} of {made}");
-    browser.say(r#"{"type":"watch","vehicle":"absent","id":2}"#).await;
+    let is_no_backlog = |sequence: u64| sequence < 4 || sequence == made - 1;
+    assert!(on_the_way.iter().all(|(sequence, _)| is_no_backlog(*sequence)), "{on_the_way:?} of {made}");
+    browser.say(r#"{"type":"watch","vehicle":"absent","id":2}"#);
     let refused = browser.text_of("refused").await;
     assert_eq!(refused["id"], 2, "no map came before the answer: {refused}");
 
@@ -108,20 +138,43 @@ async fn a_browser_on_a_slow_link_gets_the_newest_map_and_never_a_backlog() {
     let (mut last, mut skipped_sum) = (on_the_way[1].0, on_the_way[0].1 + on_the_way[1].1);
     let mut unacknowledged = VecDeque::from([on_the_way[0].0, on_the_way[1].0]);
     for _ in 0..4 {
-        browser.acknowledge(unacknowledged.pop_front().unwrap()).await;
-        let (newest, skipped) = browser.map().await;
-        assert_eq!((newest, skipped), (made - 1, newest - last - 1));
-        unacknowledged.push_back(newest);
-        (last, skipped_sum) = (newest, skipped_sum + skipped);
         let before = made;
         while made < before + 3 {
             made = feed(&running, portions.next().unwrap()).await;
         }
+        browser.acknowledge(unacknowledged.pop_front().unwrap());
+        let (newest, skipped) = browser.map().await;
+        assert_eq!((newest, skipped), (made - 1, newest - last - 1));
+        unacknowledged.push_back(newest);
+        (last, skipped_sum) = (newest, skipped_sum + skipped);
     }
     let metrics = get(running.page.unwrap(), "/metrics").await;
     let line = "clearway_skipped_maps_total{vehicle=\"car\",transport=\"page\"} ";
     let counted = metrics.lines().find_map(|text| text.strip_prefix(line)?.parse::<u64>().ok());
     assert!(counted.is_some_and(|counted| counted >= skipped_sum), "{counted:?} of {skipped_sum}:\n{metrics}");
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_peer_that_answers_no_ping_is_sent_nothing_and_then_the_newest_map() {
+    let mut config = config();
+    config.page.enabled = true;
+    let running = start(config).await;
+    let mut socket = web_socket(running.page.unwrap(), "/live?vehicle=car").await;
+    let mut ping = [0; 10];
+    within("a ping", socket.read_exact(&mut ping)).await.unwrap();
+    assert_eq!(ping[..2], [0x89, 8], "a ping of 8 bytes is first");
+    // An answer that was not read from the ping is none.
+    socket.write_all(&pong(b"a guess!")).await.unwrap();
+    let mut made = 0;
+    for portion in portions(6) {
+        made = feed(&running, portion).await;
+    }
+    assert!(made > 3);
+    socket.write_all(&pong(&ping[2..])).await.unwrap();
+    let mut browser = Browser::new(socket);
+    browser.text_of("status").await;
+    assert_eq!(browser.map().await.0, made - 1, "none of the maps before was sent");
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
@@ -148,7 +201,7 @@ async fn hundreds_of_browsers_get_every_map_and_one_too_many_is_refused_in_words
             for browser in &mut browsers {
                 let (sequence, skipped) = browser.map().await;
                 assert_eq!((sequence, skipped), (expected, 0));
-                browser.acknowledge(sequence).await;
+                browser.acknowledge(sequence);
             }
         }
     }
@@ -156,7 +209,7 @@ async fn hundreds_of_browsers_get_every_map_and_one_too_many_is_refused_in_words
     let refused = get(address, "/").await;
     assert!(refused.starts_with("HTTP/1.1 503") && refused.contains("which page.connections_max allows"), "{refused}");
     // The others stay, and so does gRPC.
-    browsers[0].say(r#"{"type":"watch","vehicle":"absent","id":2}"#).await;
+    browsers[0].say(r#"{"type":"watch","vehicle":"absent","id":2}"#);
     browsers[0].text_of("refused").await;
     let vehicles = grpc(&running).await.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap().into_inner();
     assert_eq!(vehicles.vehicles[0].name, "car");

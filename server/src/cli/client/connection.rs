@@ -65,6 +65,14 @@ fn advice(error: &str) -> Option<&'static str> {
              (port 50051 by default), not the one of the page ([page] listen, port 8080 by default)",
         );
     }
+    // A server that wants a certificate may close the connection before the alert that says so arrives.
+    let is_closed = ["CertificateRequired", "broken pipe", "operation was canceled", "transport error"];
+    if is_closed.iter().any(|part| error.contains(part)) {
+        return Some(
+            "the server has closed the connection: it requires a certificate (--cert and --key), or this is not its port \
+             of gRPC",
+        );
+    }
     let has_no_map = error.contains("no map");
     has_no_map.then_some(
         "the server has no map to give: no packet or scan has arrived since it started, or none arrives now; \
@@ -82,5 +90,7 @@ mod tests {
             "http://localhost:8080: protocol error: received message with invalid compression flag: 110 (Internal)";
         assert!(advice(error).unwrap().contains("[page] listen"));
         assert!(advice("no clearway server answers at http://localhost:1: Connection refused").is_none());
+        let error = "no clearway server answers at https://localhost:1: received fatal alert: CertificateRequired";
+        assert!(advice(error).unwrap().contains("--cert and --key"));
     }
 }

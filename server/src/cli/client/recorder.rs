@@ -2,12 +2,15 @@
 
 use anyhow::{Error, Result};
 use clap::{Args, Subcommand};
+use clearway_client::ClientError;
 use clearway_proto::v1;
 use serde_json::json;
+use tonic::Code;
 
-use crate::cli::client::connection::ServerOptions;
+use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print_line};
+use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
+use crate::record::damage::utc;
 use crate::status::recorder_json;
 
 /// Control the recorder of a running server: start, stop, split, save the last seconds, list, status.
@@ -63,7 +66,15 @@ pub fn run(options: Options) -> Result<Exit> {
 
 async fn send(Options { server, json, request }: Options) -> Result<Exit> {
     let mut recorder = server.connect().await?.recorder().await?;
-    let refused = |status: tonic::Status| Error::msg(status.message().to_owned());
+    let refused = |status: tonic::Status| match std::error::Error::source(&status) {
+        // No answer of the server, but of the connection to it.
+        Some(source) => {
+            let (address, reason) = (server.address.clone(), source.to_string());
+            explain(ClientError::Unreachable { address, reason })
+        }
+        None if status.code() == Code::InvalidArgument => usage_error(status.message()),
+        None => Error::msg(status.message().to_owned()),
+    };
     let answer = match request {
         Request::Start => recorder.start(v1::StartRecordingRequest {}).await,
         Request::Stop => recorder.stop(v1::StopRecordingRequest {}).await,
@@ -91,7 +102,9 @@ async fn send(Options { server, json, request }: Options) -> Result<Exit> {
     if status.store_waiting > 0 {
         let (parts, problem) = (counted(status.store_waiting, "part"), &status.store_problem);
         let why = if problem.is_empty() { String::new() } else { format!(": {problem}") };
-        print_line(&format!("  {parts} for the store{why}"))?;
+        let since_ns = Some(status.store_problem_since_ns).filter(|ns| *ns > 0);
+        let since = since_ns.map_or(String::new(), |ns| format!(" since {}", utc(ns)));
+        print_line(&format!("  {parts} not yet in the store{since}{why}"))?;
     }
     for (vehicle, events) in &status.durable_events {
         print_line(&format!("  {vehicle}: events below {events} are on the disk"))?;
@@ -121,7 +134,7 @@ fn print_parts(parts: &[v1::RecordedPart], json: bool) -> Result<()> {
     }
     for part in parts {
         let state = match (part.is_left, part.is_unfinished) {
-            (true, _) => ", left unfinished by a crash",
+            (true, _) => ", left unfinished by a crash or a full disk",
             (false, true) => ", unfinished",
             (false, false) => "",
         };

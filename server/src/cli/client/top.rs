@@ -8,7 +8,7 @@ use futures::StreamExt;
 
 use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::client::screen::Screen;
-use crate::cli::shared::output::{block_on, stop_signal};
+use crate::cli::shared::output::{block_on, counted, stop_signal};
 
 /// Show the vehicles of a server live: state, age, rate, loss, latency, readers, and what is wrong.
 ///
@@ -71,8 +71,8 @@ fn table(mut vehicles: Vec<v1::Vehicle>, columns: usize, is_coloured: bool) -> V
     let cut = |line: String| truncate_str(&line, columns, "…").into_owned();
     let mut lines = vec![
         cut(format!(
-            "{} vehicles: {} error, {} warn, {} ok",
-            vehicles.len(),
+            "{}: {} error, {} warn, {} ok",
+            counted(vehicles.len() as u64, "vehicle"),
             count("error"),
             count("warn"),
             count("ok")

@@ -34,7 +34,8 @@ pub enum LogFormat {
 
 /// Starts the log of this process. `RUST_LOG` selects what is logged.
 pub fn start(format: LogFormat) {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
+    let filter =
+        EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error,object_store=warn"));
     let log = tracing_subscriber::registry().with(filter).with(Limit::default());
     let lines = fmt::layer().with_writer(std::io::stderr);
     match format {

@@ -73,6 +73,8 @@ const HEAD_BYTES_MAX: usize = 16 << 10;
 const WINDOW_BYTES: u32 = 1 << 20;
 /// Most bytes that HTTP/2 holds for one stream of a client that does not read. Ours: about one map.
 const SEND_BYTES_MAX: usize = 32 << 10;
+/// Memory kept to read from a WebSocket, in bytes. Ours: its clients send short texts; the library would keep 128 KiB.
+pub const READ_BUFFER_BYTES: usize = 4 << 10;
 /// Most streams on one connection. Ours: more than a fleet page needs for its vehicles and layers.
 const STREAMS_MAX: u32 = 128;
 /// Most streams of one connection that the client reset before the server accepted them, and most that the server reset
