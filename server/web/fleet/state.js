@@ -24,8 +24,8 @@ export function stateOf(status) {
   return { state, reasons: [...served, ...(status?.reasons ?? []), ...claimed] };
 }
 
-// The age of the newest map, in ms, when it was last told: by the status, which arrived status_age_ms ago, or by the map
-// on the card, frame_age_ms old. Without news for longer it grows. null if no map is known.
+// The age of the newest map, in ms, when it was last told: by the status, which arrived status_age_ms ago, or by the
+// map on the card, frame_age_ms old. Without news for longer it grows. null if no map is known.
 export function ageOf(status, status_age_ms, frame_age_ms) {
   const silent_ms = status_age_ms > NEWS_MS ? status_age_ms : 0;
   const by_status = status.map_age_ms == null ? Infinity : status.map_age_ms + silent_ms;

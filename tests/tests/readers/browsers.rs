@@ -122,7 +122,7 @@ async fn a_browser_on_a_slow_link_gets_the_newest_map_and_never_a_backlog() {
     while made < 2 {
         made = feed(&running, portions.next().unwrap()).await;
     }
-    // The link passes nothing of the next revolutions: at most two maps are on the way, and no more are sent after them.
+    // The link passes nothing of the next revolutions: at most two maps are on the way, and none is sent after them.
     while made < 20 {
         made = feed(&running, portions.next().unwrap()).await;
     }
