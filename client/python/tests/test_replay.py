@@ -23,7 +23,7 @@ def test_a_replay_is_paused_stepped_and_sought(clearway_replay):
         assert (sought.phase, round(sought.position_s, 6)) == ("paused", 0.3)
         at = next(m for m in maps if m.sequence == sought.maps["car"] - 1)
         assert drive.step().maps["car"] == at.sequence + 2
-        # The map of the place may come twice: as a step has made it, and as the seek has sent it again.
+        # The map at the position may come twice: once from the step, and once more from the seek.
         assert next(m for m in maps if m.sequence > at.sequence).sequence == at.sequence + 1
         assert (drive.speed(2.0).speed, drive.speed(math.inf).speed) == (2.0, math.inf)
         assert drive.lockstep().lockstep and not drive.lockstep(False).lockstep

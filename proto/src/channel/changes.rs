@@ -66,7 +66,8 @@ fn mark_changed(contexts: &mut [u8], columns: usize, changed: usize) {
     }
 }
 
-/// Number of unchanged cells of context 0 at the beginning, or a smaller one if it is large.
+/// Number of unchanged cells of context 0 at the beginning, or fewer: the caller asks again for the rest, and joins the
+/// runs.
 fn calm_cells<T: Cell>(cells: &[T], now: &[T], contexts: &[u8]) -> usize {
     const BLOCK: usize = CALM.len();
     let of_eight = |((cells, now), contexts): ((&[T; 8], &[T; 8]), &[u8; 8])| {

@@ -70,6 +70,9 @@ pub(super) async fn upload_finished(
         let until = Instant::now() + period;
         while Instant::now() < until {
             tokio::time::sleep(PERIOD).await;
+            if uploads.options.delete {
+                uploads.delete_old();
+            }
             let waiting = uploads.waiting().len();
             uploads.counts.set_waiting_for_store(waiting as u64);
         }
@@ -133,20 +136,29 @@ impl Uploads {
         outcome
     }
 
-    /// The finished parts that are not settled. Deletes those that are confirmed and old enough, if it shall.
+    /// Deletes the parts that the store has confirmed and that no save of the last seconds needs.
+    fn delete_old(&mut self) {
+        let parts = self.finished();
+        let is_old = |seen: &Seen| seen.2.elapsed().is_ok_and(|age| age > self.saved);
+        for (part, seen) in parts.into_iter().filter(|(part, seen)| is_old(seen) && upload::is_confirmed(part)) {
+            if let Err(error) = upload::delete_confirmed(&part) {
+                tracing::warn!(part = %part.display(), %error, "a confirmed part cannot be deleted");
+            }
+            self.settled.remove(&seen);
+        }
+    }
+
+    /// The finished parts of the folder, also those that an earlier run has left unfinished.
+    fn finished(&self) -> Vec<(PathBuf, Seen)> {
+        let parts = self.control.list().into_iter().filter(|part| !part.is_unfinished || part.is_left);
+        let paths = parts.map(|part| PathBuf::from(part.file));
+        paths.filter_map(|path| seen(&path).map(|seen| (path, seen))).collect()
+    }
+
+    /// The finished parts that are not settled.
     fn waiting(&mut self) -> Vec<(PathBuf, Seen)> {
         let mut waiting = Vec::new();
-        for part in self.control.list().into_iter().filter(|part| !part.is_unfinished || part.is_left) {
-            let part = PathBuf::from(part.file);
-            let Some(seen) = seen(&part) else { continue };
-            let is_old = seen.2.elapsed().is_ok_and(|age| age > self.saved);
-            if self.options.delete && is_old && upload::is_confirmed(&part) {
-                if let Err(error) = upload::delete_confirmed(&part) {
-                    tracing::warn!(part = %part.display(), %error, "a confirmed part cannot be deleted");
-                }
-                self.settled.remove(&seen);
-                continue;
-            }
+        for (part, seen) in self.finished() {
             if self.settled.contains(&seen) {
                 continue;
             }
@@ -175,11 +187,12 @@ impl Uploads {
             None => location::open(&self.options.url).map_err(|error| Problem::Store(error.to_string()))?,
         };
         self.store = Some(store.clone());
-        // Any answer will do, also a refusal: what is wrong then, the part's own request says.
+        // Also a refusal is an answer: the part's own request then fails with the same reason.
         let answer = tokio::time::timeout(self.answer_timeout, store.head(&Key::from("clearway"))).await;
-        let _any = answer.map_err(|_| {
-            Problem::Store(format!("{} has not answered for {:?}", self.options.url, self.answer_timeout))
-        })?;
+        if answer.is_err() {
+            let reason = format!("{} has not answered for {:?}", self.options.url, self.answer_timeout);
+            return Err(Problem::Store(reason));
+        }
         upload::upload_prepared(&*store, part, &self.prepared[seen]).await.map_err(|error| match error {
             UploadError::Store { .. } | UploadError::Differs { .. } => Problem::Store(error.to_string()),
             error => of_part(error),

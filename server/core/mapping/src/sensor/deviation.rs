@@ -1,7 +1,7 @@
 //! How far the range of a point deviates from its neighbours', as a whole number: sums of whole numbers do not depend
 //! on the order of the points.
 
-/// Number of steps of 1: whole millionths.
+/// Number of steps in a deviation of 1 metre per metre: a step is a millionth.
 pub const STEPS: f32 = 1e6;
 /// Largest deviation of a point on the ground. Ours: a deviation of half the range is an edge; it bounds the sums.
 const DEVIATION_MAX: f32 = 0.5;

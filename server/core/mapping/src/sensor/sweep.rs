@@ -366,7 +366,7 @@ pub(crate) fn classify(x: f32, y: f32, z: f32) -> (bool, bool) {
     (is_position, is_position & (squared_range(x, y, z) > 0.0))
 }
 
-/// True if a position of the sensor frame is not within the least range.
+/// True if a position, sensor frame, metres, is at least `range_m_min` away from the sensor.
 #[inline(always)]
 fn is_far(mount: &Mount, x: f32, y: f32, z: f32) -> bool {
     squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
