@@ -65,12 +65,14 @@ fn advice(error: &str) -> Option<&'static str> {
              (port 50051 by default), not the one of the page ([page] listen, port 8080 by default)",
         );
     }
-    // A server that wants a certificate may close the connection before the alert that says so arrives.
-    let is_closed = ["CertificateRequired", "broken pipe", "operation was canceled", "transport error"];
-    if is_closed.iter().any(|part| error.contains(part)) {
+    if error.contains("CertificateRequired") {
+        return Some("the server requires a certificate: --cert and --key");
+    }
+    // A server that requires a certificate may close the connection before the alert that says so arrives.
+    if ["broken pipe", "operation was canceled", "transport error"].iter().any(|part| error.contains(part)) {
         return Some(
-            "the server has closed the connection: it requires a certificate (--cert and --key), or this is not its port \
-             of gRPC",
+            "the connection has ended: the server has stopped, requires a certificate (--cert and --key), or has another \
+             port for gRPC",
         );
     }
     let has_no_map = error.contains("no map");
@@ -92,5 +94,7 @@ mod tests {
         assert!(advice("no clearway server answers at http://localhost:1: Connection refused").is_none());
         let error = "no clearway server answers at https://localhost:1: received fatal alert: CertificateRequired";
         assert!(advice(error).unwrap().contains("--cert and --key"));
+        let error = "no clearway server answers at http://localhost:1: stream closed because of a broken pipe";
+        assert!(advice(error).unwrap().contains("the server has stopped"));
     }
 }
