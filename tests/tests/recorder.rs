@@ -373,6 +373,7 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
         ("a.mcap", true, "this file is replayed"),
         ("hard.mcap", true, "this file is replayed"),
         ("soft.mcap", true, "this file is replayed"),
+        ("./new/../a.mcap", true, "this file is replayed"),
         ("drive.pcap", false, "exists"),
     ] {
         let force = if force { &["--force"][..] } else { &[] };

@@ -1,4 +1,4 @@
-//! Recorded time -> the time of this machine, for a replay at one rate without interruption.
+//! Recorded time -> the time of this machine, for a replay at a rate, with pauses and jumps.
 
 use std::time::{Duration, Instant};
 
@@ -7,12 +7,14 @@ use clearway_proto::v1;
 use crate::encode::Replayed;
 
 /// When events of recorded time are due, and how far their stamps are from the present. It starts at the first event
-/// that it is asked about, and again after [`ReplayClock::restart`].
+/// that it is asked about. A pause stops it, also between two events; [`ReplayClock::restart`] begins elsewhere.
 #[derive(Debug)]
 pub struct ReplayClock {
     /// Speed relative to recorded time; infinite: as fast as possible.
     rate: f64,
     anchor: Option<Anchor>,
+    /// Recorded time from which it goes on; `None`: that of the next event.
+    begins_ns: Option<i64>,
 }
 
 /// An event's recorded time, and the time at which it was replayed by both clocks of this machine.
@@ -26,25 +28,38 @@ struct Anchor {
 impl ReplayClock {
     /// A clock that runs at `rate` times recorded time.
     pub fn new(rate: f64) -> Self {
-        Self { rate, anchor: None }
+        Self { rate, anchor: None, begins_ns: None }
     }
 
     /// Runs at `rate` from the next event on.
     pub fn set_rate(&mut self, rate: f64) {
-        (self.rate, self.anchor) = (rate, None);
+        self.pause();
+        self.rate = rate;
     }
 
-    /// Begins again at the next event: after a pause, a jump or any other wait.
-    pub fn restart(&mut self) {
-        self.anchor = None;
+    /// Stops until the next call of [`ReplayClock::due`]. What has passed of a silence between two events stays passed.
+    pub fn pause(&mut self) {
+        if let Some(anchor) = self.anchor.take() {
+            let passed_ns = (anchor.steady.elapsed().as_secs_f64() * self.rate * 1e9) as i64;
+            self.begins_ns = Some(anchor.recorded_ns.saturating_add(passed_ns));
+        }
+    }
+
+    /// Begins again at a recorded time; `None`: at that of the next event, whenever it comes.
+    pub fn restart(&mut self, at_ns: Option<i64>) {
+        (self.anchor, self.begins_ns) = (None, at_ns);
     }
 
     /// When the event is due; `None`: now. `wall_ns` is the wall clock's present time.
     pub fn due(&mut self, recorded_ns: i64, wall_ns: i64) -> Option<Instant> {
         if !self.rate.is_finite() {
+            self.restart(None);
             return None;
         }
-        let anchor = self.anchor.get_or_insert_with(|| Anchor { recorded_ns, steady: Instant::now(), wall_ns });
+        // An event that was due before the pause is not late after it.
+        let begins_ns = self.begins_ns.take().map_or(recorded_ns, |begins_ns| begins_ns.min(recorded_ns));
+        let steady = Instant::now();
+        let anchor = self.anchor.get_or_insert(Anchor { recorded_ns: begins_ns, steady, wall_ns });
         let passed_ns = recorded_ns.saturating_sub(anchor.recorded_ns).max(0);
         let after = Duration::try_from_secs_f64(passed_ns as f64 * 1e-9 / self.rate).unwrap_or(Duration::MAX);
         anchor.steady.checked_add(after)
@@ -84,6 +99,32 @@ mod tests {
         for recorded_ns in [5_000_000_000, 5_000_000_001, 9_123_456_789] {
             assert_eq!(clock.shift_ns(recorded_ns, 42), 1_000 - 5_000_000_000);
         }
+    }
+
+    #[test]
+    fn a_pause_in_a_silence_does_not_shorten_it() {
+        let mut clock = ReplayClock::new(1.0);
+        clock.due(1_000_000_000, 0);
+        let due = clock.due(7_000_000_000, 0).unwrap();
+        for _ in 0..2 {
+            clock.pause();
+        }
+        // The pause itself took no recorded time.
+        let (due_after, now) = (clock.due(7_000_000_000, 0).unwrap(), Instant::now());
+        assert!(due_after >= due && due_after - now > Duration::from_secs(5), "{:?}", due_after - now);
+        clock.pause();
+        // An event that has been passed is due at once.
+        let passed = clock.due(500_000_000, 0).unwrap();
+        assert!(passed <= Instant::now());
+        clock.restart(Some(3_000_000_000));
+        assert!(clock.due(7_000_000_000, 0).unwrap() - Instant::now() > Duration::from_secs(3), "4 s after a jump");
+        clock.restart(None);
+        assert!(clock.due(9_000_000_000, 0).unwrap() <= Instant::now());
+        clock.pause();
+        clock.set_rate(f64::INFINITY);
+        assert_eq!(clock.due(10_000_000_000, 0), None);
+        clock.set_rate(1.0);
+        assert!(clock.due(60_000_000_000, 0).unwrap() <= Instant::now(), "the clock did not run meanwhile");
     }
 
     #[test]

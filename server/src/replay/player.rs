@@ -139,7 +139,7 @@ impl Player {
         loop {
             match self.state.phase() {
                 ReplayPhase::Playing if !self.is_acknowledged()? => {
-                    self.clock.restart();
+                    self.clock.pause();
                     if self.wait(Instant::now())?.is_err() {
                         return Ok(Err(Stopped));
                     }
@@ -159,7 +159,7 @@ impl Player {
                     return Ok(Ok(()));
                 }
                 _ => {
-                    self.clock.restart();
+                    self.clock.pause();
                     if self.wait(Instant::now() + POLL)?.is_err() {
                         return Ok(Err(Stopped));
                     }
@@ -188,7 +188,7 @@ impl Player {
     fn wait_for(&mut self, at_ns: i64) -> Result<Result<(), Stopped>, PlayError> {
         if self.step.is_some() {
             // A step is as fast as possible, and its stamps are those of the present.
-            self.clock.restart();
+            self.clock.restart(None);
         }
         let due = self.step.is_none().then(|| self.clock.due(at_ns, now_ns())).flatten();
         let now = Instant::now();
@@ -405,7 +405,6 @@ impl Player {
             }
             (None, None) => {}
         }
-        self.clock.restart();
         self.report();
         Ok(Ok(()))
     }
@@ -437,7 +436,7 @@ impl Player {
             }
         }
         self.state.position_ns = to_ns;
-        self.clock.restart();
+        self.clock.restart(Some(to_ns));
         let now_ns = now_ns();
         let (clock, state, boot_id) = (&self.clock, &self.state, self.options.boot_id);
         for ReplayedVehicle { engine, .. } in &mut self.vehicles {
@@ -463,7 +462,7 @@ impl Player {
 
     fn set_phase(&mut self, phase: ReplayPhase) {
         self.state.set_phase(phase);
-        self.clock.restart();
+        self.clock.pause();
         for vehicle in &self.vehicles {
             vehicle.engine.update_status();
             vehicle.engine.status.set_replay_phase(phase);

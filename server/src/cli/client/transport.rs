@@ -11,7 +11,7 @@ use crate::cli::make::replay::{Speed, state};
 use crate::cli::shared::output::{block_on, print_line, usage_error};
 use crate::replay::control::STEP_MAX;
 
-/// Control the replay of a server: pause, play, step, seek, range, speed, loop, lockstep.
+/// Control the replay of a server: pause, play, step, seek, range, rate, loop, lockstep.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway transport

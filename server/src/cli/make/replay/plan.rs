@@ -174,6 +174,10 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
         let reason = "a recording begins with the first event; --to may end it earlier";
         return unused(format!("--from {from}"), reason.into());
     }
+    // A name such as `new/../drive.mcap` names a file only when its folders exist. The recorder says if that fails.
+    if let Some(folder) = record.parent() {
+        let _ = std::fs::create_dir_all(folder);
+    }
     // A folder stands for the files in it.
     let is_in = |folder: &Path| {
         let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
