@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::process::{Command, Output};
 
 use clearway::record::mcap_reader::McapReader;
 use clearway::record::reader::{RecordedMessage, RecordingReader};
@@ -95,6 +95,17 @@ fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
     runner.run(&change, |(at, bit)| copy.flip(&original, at, bit).map(drop).map_err(TestCaseError::fail)).unwrap();
     // The heads of the records have few of all bytes, but all of the framing.
     let bytes = in_chunks();
+    // The name of the metadata, a digit of its boot id, and the kind of the record that ends the data: no checksum but
+    // that of the whole section covers them.
+    let (metadata, data_end) = (records(&bytes, op::METADATA)[0], records(&bytes, op::DATA_END)[0]);
+    let digit = bytes.windows(7).position(|text| text == b"boot_id").unwrap() + 7 + 4;
+    for (byte, bit) in [(metadata + 15, 0), (digit, 0), (digit + 3, 1)] {
+        let outcome = copy.flip(&original, byte, bit).unwrap();
+        assert!(outcome.repaired && outcome.lost == 0, "byte {byte}, bit {bit}: {outcome:?}");
+    }
+    for bit in 0..8 {
+        copy.flip(&original, data_end, bit).unwrap_or_else(|error| panic!("the end of the data: {error}"));
+    }
     for at in records(&bytes, op::CHUNK).into_iter().chain(records(&bytes, op::MESSAGE_INDEX)) {
         for (byte, bit) in [(at, 0), (at, 7), (at + 1, 3), (at + 4, 1), (at + 8, 6), (at + 9 + 16, 2)] {
             copy.flip(&original, byte, bit).unwrap();
@@ -224,6 +235,12 @@ fn a_repair_without_a_loss_ends_with_success() {
     });
     assert!(said.contains("the CRC of the summary section") && said.contains("\"lost_messages\": null"), "{said}");
     assert!(code == Some(0) && said.contains(&format!("\"messages\": {all},")), "{code:?}: {said}");
+    // A crash while the summary was written.
+    let (said, code) = repaired(|bytes| bytes.truncate(records(bytes, op::STATISTICS)[0] + 5));
+    assert!(code == Some(0) && said.contains("cut after"), "{code:?}: {said}");
+    assert!(said.contains(&format!("\"messages\": {all},")), "{said}");
+    let (said, code) = repaired(|bytes| bytes.truncate(records(bytes, op::DATA_END)[0] + 5));
+    assert!(code == Some(1) && said.contains("cut after"), "the data may have gone on: {code:?}: {said}");
 }
 
 #[test]
@@ -334,4 +351,23 @@ fn a_recording_of_a_later_version_is_refused_by_name() {
     let schema = refused(&write("schema.mcap", &[("version", "3.0.0")], "clearway.v2.Event"));
     assert!(schema.contains("clearway.v2.Event") && schema.contains("3.0.0"), "{schema}");
     RecordingReader::open(&write("earlier.mcap", &[], "clearway.v1.Event")).unwrap();
+}
+
+#[test]
+fn a_pipe_is_refused_and_not_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipe = folder.path().join("pipe.mcap");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    for command in ["replay", "verify", "info", "repair", "export", "send"] {
+        let arguments: &[&str] = match command {
+            "repair" => &["pipe.mcap", "new.mcap"],
+            "export" => &["pipe.mcap", "--format", "json", "--out", "maps"],
+            "send" => &["pipe.mcap", "--to", "udp://127.0.0.1:9"],
+            _ => &["pipe.mcap"],
+        };
+        let output = run(folder.path(), "clearway", &[&[command], arguments].concat());
+        let said = text(&output.stderr);
+        assert!(said.contains("a pipe or a device"), "{command}: {said}");
+        assert_eq!(output.status.code(), Some(2), "{command}: {said}");
+    }
 }

@@ -349,45 +349,6 @@ async fn without_a_recorder_each_request_is_refused() {
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
-#[test]
-fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
-    let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    let replay = |arguments: &[&str]| {
-        let output = clearway_tests::run(folder.path(), "clearway", &[&["replay"], arguments].concat());
-        (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())
-    };
-    let simulated = clearway_tests::run(
-        folder.path(),
-        "clearway",
-        &["simulate", "town", "--sensor", "vlp16", "--seconds", "1", "--out", "drive.pcap"],
-    );
-    assert!(simulated.status.success(), "{}", String::from_utf8_lossy(&simulated.stderr));
-    let (recorded, error) = replay(&["drive.pcap", "--record", "a.mcap"]);
-    assert!(recorded, "{error}");
-    let bytes = std::fs::read(at("a.mcap")).unwrap();
-    std::fs::hard_link(at("a.mcap"), at("hard.mcap")).unwrap();
-    std::os::unix::fs::symlink("a.mcap", at("soft.mcap")).unwrap();
-    for (output, force, expected) in [
-        ("a.mcap", false, "this file is replayed"),
-        ("a.mcap", true, "this file is replayed"),
-        ("hard.mcap", true, "this file is replayed"),
-        ("soft.mcap", true, "this file is replayed"),
-        ("./new/../a.mcap", true, "this file is replayed"),
-        ("drive.pcap", false, "exists"),
-    ] {
-        let force = if force { &["--force"][..] } else { &[] };
-        let (success, error) = replay(&[&["a.mcap", "--record", output][..], force].concat());
-        assert!(!success && error.contains(expected), "{output}: {error}");
-        assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "{output}: the input is unchanged");
-    }
-    std::fs::write(at("old.mcap"), "old").unwrap();
-    let (success, error) = replay(&["a.mcap", "--record", "old.mcap", "--force"]);
-    assert!(success, "{error}");
-    assert!(verify(&at("old.mcap")).unwrap().is_good());
-    assert!(!at("old.unfinished.mcap").exists());
-}
-
 /// A server in its own process that records to `folder`; its data address and its page.
 fn serving(folder: &Path, run: usize) -> (Child, SocketAddr, SocketAddr) {
     let free = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();

@@ -4,6 +4,7 @@ mod fixture;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 
 use clearway::cli::make::replay::{Mount, Options, ReplayError, Summary, describe, replay};
 use clearway::record::verify::verify;
@@ -185,4 +186,73 @@ async fn a_map_of_all_default_layers_is_at_most_64_kib_except_of_a_vls128() {
         assert!(*largest <= allowed << 10, "{file}: {largest}");
         assert!(most["safe_path"] <= 9_000, "{file}: {most:?}");
     }
+}
+
+#[test]
+fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let replay = |arguments: &[&str]| {
+        let output = clearway_tests::run(folder.path(), "clearway", &[&["replay"], arguments].concat());
+        (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let simulated = clearway_tests::run(
+        folder.path(),
+        "clearway",
+        &["simulate", "town", "--sensor", "vlp16", "--seconds", "1", "--out", "drive.pcap"],
+    );
+    assert!(simulated.status.success(), "{}", String::from_utf8_lossy(&simulated.stderr));
+    let (recorded, error) = replay(&["drive.pcap", "--record", "a.mcap"]);
+    assert!(recorded, "{error}");
+    let bytes = std::fs::read(at("a.mcap")).unwrap();
+    std::fs::hard_link(at("a.mcap"), at("hard.mcap")).unwrap();
+    std::os::unix::fs::symlink("a.mcap", at("soft.mcap")).unwrap();
+    for (output, force, expected) in [
+        ("a.mcap", false, "this file is replayed"),
+        ("a.mcap", true, "this file is replayed"),
+        ("hard.mcap", true, "this file is replayed"),
+        ("soft.mcap", true, "this file is replayed"),
+        ("./new/../a.mcap", true, "this file is replayed"),
+        ("drive.pcap", false, "exists"),
+    ] {
+        let force = if force { &["--force"][..] } else { &[] };
+        let (success, error) = replay(&[&["a.mcap", "--record", output][..], force].concat());
+        assert!(!success && error.contains(expected), "{output}: {error}");
+        assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "{output}: the input is unchanged");
+    }
+    std::fs::write(at("old.mcap"), "old").unwrap();
+    let (success, error) = replay(&["a.mcap", "--record", "old.mcap", "--force"]);
+    assert!(success, "{error}");
+    assert!(verify(&at("old.mcap")).unwrap().is_good());
+    assert!(!at("old.unfinished.mcap").exists());
+    let (success, error) = replay(&[".", "--record", "b.mcap"]);
+    assert!(!success && error.contains("the folder . is replayed"), "{error}");
+}
+
+#[test]
+fn a_replay_that_ends_early_does_not_replace_a_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let golden = clearway_tests::workspace().join("tests/golden/drive.mcap");
+    let (ready, old) = (at("ready.json"), at("old.mcap"));
+    std::fs::write(&old, "old").unwrap();
+    let mut replay = Command::new(clearway_tests::binaries().join("clearway"));
+    replay.arg("replay").arg(&golden).args(["--serve", "--paused", "--any-port", "--force", "--record"]).arg(&old);
+    let mut replay =
+        replay.arg("--ready-file").arg(&ready).stderr(Stdio::null()).stdout(Stdio::piped()).spawn().unwrap();
+    while !ready.exists() {
+        assert!(replay.try_wait().unwrap().is_none(), "the replay runs");
+        std::thread::yield_now();
+    }
+    let stopped = Command::new("kill").args(["-TERM", &replay.id().to_string()]).status().unwrap();
+    assert!(stopped.success());
+    let output = replay.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    assert_eq!(std::fs::read(&old).unwrap(), b"old");
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(said.contains("old.unfinished.mcap"), "{said}");
+    assert!(verify(&at("old.unfinished.mcap")).unwrap().incomplete.is_none());
+    let mut names: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|of| of.unwrap().file_name()).collect();
+    names.sort();
+    assert_eq!(names, ["old.mcap", "old.unfinished.mcap"], "nothing else is left");
 }

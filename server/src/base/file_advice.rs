@@ -1,7 +1,21 @@
-//! The system's error about a file -> an error that says what is wrong with the file, and what to do.
+//! A path -> an open file, or an error that says what is wrong with the file, and what to do.
 
+use std::fs::File;
 use std::io::{Error, ErrorKind};
 use std::path::Path;
+
+/// Opens a file that is read more than once. A pipe or a device is refused, before its opening can wait for a writer.
+///
+/// # Errors
+/// The system's error; [`ErrorKind::InvalidInput`] for a pipe, a socket or a device.
+pub fn open_to_read(file: &Path) -> Result<File, Error> {
+    let metadata = file.metadata()?;
+    if !metadata.is_file() && !metadata.is_dir() {
+        let advice = "this is a pipe or a device, and the data is read more than once; save it to a file first";
+        return Err(Error::new(ErrorKind::InvalidInput, advice));
+    }
+    File::open(file)
+}
 
 /// The error of `file`, which could not be read or created, with a text that says what is wrong and what to do. The
 /// text does not name the file, because the caller does.
@@ -28,7 +42,7 @@ pub fn advised(file: &Path, error: Error) -> Error {
 
 #[cfg(test)]
 mod tests {
-    use std::fs::{self, File};
+    use std::fs;
 
     use super::*;
 

@@ -6,7 +6,7 @@
 //! | `sync` | a mutex -> its value, also after a panic |
 //! | `counted` | a count and a noun -> text |
 //! | [`directory`] | the name of a vehicle -> what is served for it |
-//! | `file_advice` | a path and an error -> what to do about it |
+//! | `file_advice` | a path -> an open file, or an error that says what to do |
 //! | [`held_sockets`] | sockets that systemd holds -> listeners |
 
 pub mod clock;

@@ -1,6 +1,5 @@
 //! A file -> its records, by the kind of the file: MCAP, or a ROS 2 bag in sqlite.
 
-use std::fs::File;
 use std::io::{Error, ErrorKind, Read, Seek};
 use std::path::Path;
 
@@ -10,6 +9,7 @@ use mcap::records::Record;
 use super::bag_records::BagRecords;
 use super::damage::LostPart;
 use super::mcap_records::{McapRecords, RecordsError};
+use crate::base::file_advice::open_to_read;
 
 /// First bytes of a bag in sqlite.
 const SQLITE: &[u8] = b"SQLite format 3\0";
@@ -24,7 +24,7 @@ pub(super) enum FileRecords {
 impl FileRecords {
     /// Opens a file. With `any_start`, wrong first bytes are damage and not an error.
     pub(super) fn open(path: &Path, any_start: bool) -> Result<Self, Error> {
-        let mut file = File::open(path)?;
+        let mut file = open_to_read(path)?;
         let metadata = file.metadata()?;
         if metadata.is_file() && metadata.len() == 0 {
             return Err(Error::new(ErrorKind::UnexpectedEof, "the file is empty"));
@@ -53,6 +53,15 @@ impl FileRecords {
     pub(super) fn has_end(&self) -> bool {
         match self {
             Self::Mcap(records) => records.has_footer(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(records) => records.has_end(),
+        }
+    }
+
+    /// True if the file was read to the end of its data.
+    pub(super) fn has_data_end(&self) -> bool {
+        match self {
+            Self::Mcap(records) => records.has_data_end(),
             #[cfg(feature = "sqlite")]
             Self::Bag(records) => records.has_end(),
         }

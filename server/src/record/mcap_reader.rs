@@ -19,6 +19,7 @@ use prost::Message as _;
 use crate::base::counted::counted;
 use crate::base::file_advice::advised;
 
+use super::channel::{Channel, Content};
 use super::damage::Damage;
 use super::file_records::FileRecords;
 use super::mcap_records::{McapRecords, RecordsError};
@@ -44,52 +45,6 @@ pub struct Header {
     pub config: Option<String>,
     /// The configured calibration tables: attachment name, ROS YAML.
     pub calibrations: BTreeMap<String, String>,
-}
-
-/// One channel of an MCAP file.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Channel {
-    /// The topic, such as `/<vehicle>/map/<layer>`.
-    pub topic: String,
-    /// The name of the schema, such as `clearway.v1.Map`.
-    pub schema: String,
-    /// The kind of the messages.
-    pub content: Content,
-}
-
-/// The kind of the messages of a channel.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Content {
-    /// Events of a vehicle's journal.
-    Journal {
-        /// The vehicle's name.
-        vehicle: String,
-    },
-    /// Maps of a vehicle, with one layer each.
-    Map {
-        /// The vehicle's name.
-        vehicle: String,
-        /// The layer's name.
-        layer: String,
-    },
-    /// Digests of a vehicle's maps, with one layer each.
-    Digest {
-        /// The vehicle's name.
-        vehicle: String,
-        /// The layer's name.
-        layer: String,
-    },
-    /// Keyframes of a vehicle.
-    Keyframe {
-        /// The vehicle's name.
-        vehicle: String,
-    },
-    /// Counts of the recorder.
-    Counts,
-    /// ROS 2 messages in CDR.
-    Ros(Kind),
-    /// Anything else.
-    Other,
 }
 
 /// One message of an MCAP file.
@@ -328,6 +283,13 @@ impl McapReader {
         faults
     }
 
+    /// True if the faults of [`McapReader::faults_of_end`] may have cost a record. A file that is cut after its data
+    /// lacks only repetitions.
+    pub(super) fn is_loss_at_end(&self) -> bool {
+        let harmless = usize::from(self.is_cut() && self.records.has_data_end());
+        self.faults_of_end().len() > harmless
+    }
+
     /// Number of messages by the file's own count, if it can be trusted; `None` before the last message.
     pub(super) fn stated_messages(&self) -> Option<u64> {
         self.stated.as_ref().filter(|_| self.has_ended).map(|(messages, _)| *messages)
@@ -405,7 +367,7 @@ impl McapReader {
             }
             Record::Channel(of) => {
                 let schema = self.schemas.get(&of.schema_id).cloned().unwrap_or_default();
-                let content = content(&of.topic, &schema, &of.message_encoding);
+                let content = Content::of(&of.topic, &schema, &of.message_encoding);
                 self.channels.insert(of.id, Arc::new(Channel { topic: of.topic.clone(), schema, content }));
             }
             Record::Message { header, .. } => {
@@ -475,25 +437,4 @@ impl Iterator for McapReader {
 fn open(file: &Path, any_start: bool) -> Result<FileRecords, McapReadError> {
     let wrong = |source| McapReadError::Read { file: file.to_owned(), source: advised(file, source) };
     FileRecords::open(file, any_start).map_err(wrong)
-}
-
-/// The kind of the messages of a channel, by its topic, the name of its schema, and its encoding.
-fn content(topic: &str, schema: &str, encoding: &str) -> Content {
-    // A bag that was converted from ROS 1 has the same types in another encoding.
-    if let Some(kind) = Kind::from_name(schema).filter(|_| encoding == "cdr") {
-        return Content::Ros(kind);
-    }
-    let parts: Vec<&str> = topic.split('/').collect();
-    match (schema, &parts[..]) {
-        ("clearway.v1.Event", ["", vehicle, "journal"]) => Content::Journal { vehicle: (*vehicle).into() },
-        ("clearway.v1.Map", ["", vehicle, "map", layer]) => {
-            Content::Map { vehicle: (*vehicle).into(), layer: (*layer).into() }
-        }
-        ("clearway.v1.MapDigest", ["", vehicle, "digest", layer]) => {
-            Content::Digest { vehicle: (*vehicle).into(), layer: (*layer).into() }
-        }
-        ("clearway.v1.Keyframe", ["", vehicle, "keyframe"]) => Content::Keyframe { vehicle: (*vehicle).into() },
-        ("clearway.v1.RecordingCounts", ["", "recorder", "counts"]) => Content::Counts,
-        _ => Content::Other,
-    }
 }

@@ -70,6 +70,7 @@ pub(super) struct McapRecords {
     indexes_are_lost: bool,
     /// The bytes of the newest record, if it is of a private kind. Message indexes behind it say that it was a chunk.
     private: Option<(u64, u64)>,
+    has_data_end: bool,
     has_footer: bool,
     has_sound_summary: bool,
     lost: Vec<LostPart>,
@@ -92,6 +93,7 @@ impl McapRecords {
             has_chunks: false,
             indexes_are_lost: false,
             private: None,
+            has_data_end: false,
             has_footer: false,
             has_sound_summary: false,
             lost: Vec::new(),
@@ -101,6 +103,11 @@ impl McapRecords {
     /// Number of bytes read and consumed so far.
     pub(super) fn offset(&self) -> u64 {
         self.offset
+    }
+
+    /// True if the file was read to the record that ends its data; only repetitions follow it.
+    pub(super) fn has_data_end(&self) -> bool {
+        self.has_data_end
     }
 
     /// True if the file has its closing records.
@@ -235,6 +242,7 @@ impl McapRecords {
     /// Consumes the record that ends the data section, and checks the section's CRC unless a part of it is lost.
     fn end_data(&mut self, saved: u32, end: usize) {
         let (from, crc) = (self.offset, std::mem::take(&mut self.crc));
+        self.has_data_end = true;
         self.consume(end);
         self.crc = SectionCrc::default();
         match crc.compare(saved) {
@@ -256,6 +264,9 @@ impl McapRecords {
     /// Consumes the footer, checks the CRC of the summary, and what follows.
     fn end_summary(&mut self, saved: u32, end: usize) -> Result<(), RecordsError> {
         let from = self.offset;
+        if !self.has_data_end {
+            self.add_lost((from, from), &"the record that ends the data is missing, and with it the data's CRC");
+        }
         // The CRC covers the footer up to the CRC itself.
         let covered = end - size_of::<u32>();
         self.consume(covered);

@@ -9,6 +9,7 @@
 //! | `bag_records` | a ROS 2 bag in sqlite -> the same records |
 //! | `file_records` | a file of either kind -> its records |
 //! | `mcap_summary` | the end of an MCAP file -> its schemas and channels |
+//! | [`channel`] | the topic, schema and encoding of a channel -> the kind of its messages |
 //! | [`mcap_reader`] | those records -> the header and the messages |
 //! | [`damage`] | a part that cannot be read -> what is lost with it |
 //! | [`reader`] | those messages -> events, maps, ROS 2 messages |
@@ -18,6 +19,7 @@
 
 #[cfg(feature = "sqlite")]
 mod bag_records;
+pub mod channel;
 mod chunk;
 pub mod compare;
 pub mod damage;

@@ -12,8 +12,9 @@ use clearway_proto::v1;
 use clearway_ros::Kind;
 use prost::Message as _;
 
+use super::channel::Content;
 use super::damage::Damage;
-use super::mcap_reader::{Content, Header, McapReadError, McapReader, Message};
+use super::mcap_reader::{Header, McapReadError, McapReader, Message};
 use crate::config::{Calibrations, Config, ConfigError, RecordedMaps};
 use crate::encode::{EventDecodeError, event_from_bytes};
 
@@ -104,6 +105,41 @@ pub enum RecordingError {
     },
 }
 
+/// What the first messages of a recording say about its run. They are in a chunk with a checksum, which the metadata
+/// does not have.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Beginning {
+    /// The boot id of the first map; `None` if the file has no map.
+    pub boot_id: Option<u64>,
+    /// Sequence of the first event; `None` if the file has no event before its first map.
+    pub first_event: Option<u64>,
+}
+
+impl Beginning {
+    /// Reads a recording up to its first map.
+    ///
+    /// # Errors
+    /// As [`RecordingReader::open`], and those of its messages.
+    pub fn of(file: &Path) -> Result<Self, RecordingError> {
+        let mut beginning = Self::default();
+        for message in RecordingReader::open(file)? {
+            let header = match message? {
+                RecordedMessage::Event { event, .. } => {
+                    beginning.first_event.get_or_insert(event.sequence);
+                    continue;
+                }
+                RecordedMessage::Map { bytes, .. } => v1::Map::decode(bytes).ok().and_then(|map| map.header),
+                RecordedMessage::Digest { digest, .. } => digest.header,
+                _ => continue,
+            };
+            let recorded_boot_id = |header: v1::Header| header.replay.map_or(header.boot_id, |of| of.recorded_boot_id);
+            beginning.boot_id = header.map(recorded_boot_id);
+            break;
+        }
+        Ok(beginning)
+    }
+}
+
 /// An open recording; an iterator over its messages. It skips messages of other kinds.
 pub struct RecordingReader {
     reader: McapReader,
@@ -163,9 +199,9 @@ impl RecordingReader {
         self.reader.incomplete()
     }
 
-    /// The number of the part; 1 for a recording without parts.
-    pub fn part(&self) -> u64 {
-        self.header().metadata.get("part").and_then(|part| part.parse().ok()).unwrap_or(1)
+    /// The number of the part; `None` if the metadata lacks it.
+    pub fn part(&self) -> Option<u64> {
+        self.header().metadata.get("part").and_then(|part| part.parse().ok())
     }
 
     /// What the recording holds of the maps.

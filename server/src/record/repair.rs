@@ -159,10 +159,11 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
     if report.messages == 0 {
         return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });
     }
-    let faults_of_end = reader.faults_of_end();
-    report.is_loss = report.damages.iter().any(|damage| damage.is_loss) || !faults_of_end.is_empty();
+    report.is_loss = report.damages.iter().any(|damage| damage.is_loss) || reader.is_loss_at_end();
     let mut at_end: Vec<String> = report.damages[damages..].iter().map(ToString::to_string).collect();
-    at_end.extend(faults_of_end);
+    if reader.is_loss_at_end() {
+        at_end.extend(reader.faults_of_end());
+    }
     if !at_end.is_empty() {
         writer.write_metadata(&lost_here(at_end)).map_err(failed)?;
     }

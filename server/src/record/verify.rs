@@ -26,7 +26,7 @@ use crate::config::RecordedMaps;
 use crate::encode::{EncodedMap, as_served, as_served_with};
 use crate::record::damage::Damage;
 use crate::record::mcap_file::sha256;
-use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
+use crate::record::reader::{Beginning, RecordedMessage, RecordingError, RecordingReader};
 
 /// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
 const DIFFERENCES_MAX: usize = 20;
@@ -224,10 +224,12 @@ struct VehicleReplay {
 /// configuration is invalid.
 pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let mut recording = RecordingReader::open(file)?;
-    let boot_id = recording.header().boot_id;
+    let beginning = if recording.maps() == RecordedMaps::None { Beginning::default() } else { Beginning::of(file)? };
+    let stated_boot_id = recording.header().boot_id;
+    let boot_id = beginning.boot_id.unwrap_or(stated_boot_id);
     let (config, tables) = recording.config()?;
     let mut replays = Vec::new();
-    let is_first_part = recording.part() == 1;
+    let is_first_part = recording.part().map_or(beginning.first_event == Some(0), |part| part == 1);
     for (vehicle, tables) in config.vehicles.iter().zip(tables) {
         let config = vehicle.core();
         let pipeline = Pipeline::new(&config, tables.clone())?;
@@ -294,6 +296,10 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     report.damages = recording.damages();
     report.incomplete = recording.incomplete();
     report.repaired = recording.repaired().to_vec();
+    if boot_id != stated_boot_id && report.repaired.is_empty() {
+        let differs = format!("its metadata has the boot id {stated_boot_id}, and its maps have {boot_id}");
+        report.incomplete.get_or_insert(differs);
+    }
     for replay in &replays {
         // The recorder writes an event before its map, so a cut can remove only the map of the last event.
         let tail = replay.computed.last_key_value().map(|((sequence, _), _)| *sequence);

@@ -36,6 +36,9 @@ struct Arguments {
     /// Number of changed bits.
     #[arg(long, default_value_t = 10_000)]
     flips: usize,
+    /// Change every bit of this many bytes at the start and at the end.
+    #[arg(long, default_value_t = 0)]
+    flips_at_ends: usize,
     /// Write the recording again in chunks of this size first.
     #[arg(long)]
     chunk_bytes: Option<u64>,
@@ -76,9 +79,20 @@ fn main() -> ExitCode {
     }) && is_good;
     let folder = TempDir::new().expect("a folder");
     let copies = AtomicUsize::new(0);
-    let is_good = judge("flips", arguments.flips, arguments.threads, || {
+    let copy = || {
         let copy = folder.path().join(format!("{}.mcap", copies.fetch_add(1, Ordering::Relaxed)));
-        let (original, copy) = (&original, original.copy(&copy).expect("a copy"));
+        original.copy(&copy).expect("a copy")
+    };
+    let ends = arguments.flips_at_ends.min(original.length() / 2);
+    let is_good = judge("flips at the ends", ends * 16, arguments.threads, || {
+        let (original, copy) = (&original, copy());
+        move |index| {
+            let (byte, bit) = (index / 8, (index % 8) as u8);
+            copy.flip(original, if byte < ends { byte } else { original.length() - 2 * ends + byte }, bit)
+        }
+    }) && is_good;
+    let is_good = judge("flips", arguments.flips, arguments.threads, || {
+        let (original, copy) = (&original, copy());
         move |index| {
             let random = random(arguments.seed, index as u64);
             copy.flip(original, (random >> 3) as usize % original.length(), (random & 7) as u8)

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
-use std::fs::File;
 use std::io::{BufReader, Read};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -18,6 +17,7 @@ use clearway_mapping::event::Scan;
 use clearway_mapping::scan_file;
 use serde_json::{Map, Value, json};
 
+use crate::base::file_advice::open_to_read;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line};
@@ -181,8 +181,8 @@ struct Source {
 }
 
 fn capture(file: &Path) -> Result<Value> {
-    let mut capture =
-        Capture::new(BufReader::new(File::open(file)?)).context("MCAP, .db3, pcap, pcapng, .bin and .pcd are known")?;
+    let mut capture = Capture::new(BufReader::new(open_to_read(file)?))
+        .context("MCAP, .db3, pcap, pcapng, .bin and .pcd are known")?;
     let mut sources: BTreeMap<SocketAddr, Source> = BTreeMap::new();
     let (mut packets, mut telemetry, mut other) = (0_u64, 0_u64, 0_u64);
     let mut ports: BTreeMap<String, u64> = BTreeMap::new();

@@ -6,14 +6,14 @@ use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
 
-use crate::base::file_advice::advised;
+use crate::base::file_advice::{advised, open_to_read};
 
 /// Opens a file to read; returns it and its length in bytes.
 ///
 /// # Errors
-/// If it does not exist, is a folder, is empty, or cannot be read.
+/// If it does not exist, is a folder, a pipe or a device, is empty, or cannot be read.
 pub fn open(file: &Path) -> Result<(File, u64)> {
-    let opened = File::open(file).map_err(|error| wrong(file, error))?;
+    let opened = open_to_read(file).map_err(|error| wrong(file, error))?;
     let metadata = opened.metadata().map_err(|error| wrong(file, error))?;
     if metadata.is_dir() {
         bail!("{}: this is a folder; name a file", file.display());

@@ -5,7 +5,6 @@
 //! does, and the core refuses it with a reason.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::BufReader;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -16,6 +15,7 @@ use clearway_lidar::packet::PACKET_LENGTH;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_mapping::event::Body;
 
+use crate::base::file_advice::open_to_read;
 use crate::ingest::queue::Reading;
 
 /// A capture cannot be read further.
@@ -54,7 +54,7 @@ impl Source {
     /// # Errors
     /// [`CaptureError::Open`] if the file cannot be opened, [`CaptureError::Read`] if it is not a capture.
     pub fn open(file: &Path) -> Result<Self, CaptureError> {
-        let open = File::open(file).map_err(|source| CaptureError::Open { file: file.to_owned(), source })?;
+        let open = open_to_read(file).map_err(|source| CaptureError::Open { file: file.to_owned(), source })?;
         let capture = Capture::new(BufReader::new(open));
         let capture = capture.map_err(|source| CaptureError::Read { file: file.to_owned(), source })?;
         Ok(Self { file: file.to_owned(), capture, sensor: None, others: BTreeMap::new(), truncated: None })

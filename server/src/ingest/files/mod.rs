@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 use clearway_mapping::event::Body;
 use clearway_mapping::scan_file::ScanFormat;
 
-use crate::base::file_advice::advised;
+use crate::base::file_advice::{advised, open_to_read};
 use crate::ingest::queue::Reading;
 use crate::ingest::ros::decoder::TopicDecoder;
 use capture::CaptureError;
@@ -308,7 +308,7 @@ impl Iterator for Readings {
 /// [`FilesError::Open`] if the file cannot be read or is empty, [`FilesError::Kind`] if its kind is unknown.
 pub fn kind(file: &Path) -> Result<Kind, FilesError> {
     let mut magic = Vec::new();
-    std::fs::File::open(file)
+    open_to_read(file)
         .and_then(|open| open.take(8).read_to_end(&mut magic))
         .map_err(|source| FilesError::Open { file: file.to_owned(), source: advised(file, source) })?;
     match &magic[..] {

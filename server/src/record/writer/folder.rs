@@ -252,7 +252,7 @@ impl Files for Folder {
     }
 
     fn path(&self, part: u64) -> PathBuf {
-        with_infix(&self.finished(part), "unfinished")
+        unfinished(&self.finished(part))
     }
 
     fn keep(&mut self, parts: &[u64], name: &str) -> io::Result<Vec<PathBuf>> {
@@ -362,13 +362,18 @@ fn with_infix(file: &Path, infix: &str) -> PathBuf {
     file.with_file_name(format!("{stem}.{infix}.{extension}"))
 }
 
+/// The name of a file until it is whole.
+pub fn unfinished(file: &Path) -> PathBuf {
+    with_infix(file, "unfinished")
+}
+
 /// True if a recording to `file` would meet a file of an earlier one: its first part or, if that was deleted, another.
 fn is_taken(file: &Path) -> bool {
     let parts = with_infix(file, "part-").file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let name = |entry: io::Result<fs::DirEntry>| Some(entry.ok()?.file_name().to_string_lossy().into_owned());
     let mut names = fs::read_dir(parent_of(file)).into_iter().flatten().filter_map(name);
     file.symlink_metadata().is_ok()
-        || with_infix(file, "unfinished").exists()
+        || unfinished(file).exists()
         || names.any(|name| name.starts_with(&parts) && is_part_of(file, Path::new(&name)))
 }
 

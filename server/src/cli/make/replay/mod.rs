@@ -7,6 +7,7 @@
 //! | `plan` | options, files -> configuration, mount, readings |
 //! | `recordings` | files -> recordings of several vehicles; sensors that do not fit |
 //! | `ready_file` | the running server -> the file that tells programs its addresses |
+//! | `former` | --force, the end of the replay -> the former recording or the new one |
 //! | `keys` | lines of a terminal -> requests |
 //! | [`state`] | the state of the replay -> text, JSON |
 //! | [`clouds`] | revolutions -> PCD files |
@@ -42,6 +43,7 @@ use crate::server::{Running, Server, Setup, random};
 use crate::status::VehicleStatus;
 
 pub mod clouds;
+mod former;
 mod keys;
 pub mod options;
 mod plan;
@@ -50,6 +52,7 @@ mod recordings;
 pub mod state;
 pub mod summary;
 
+use former::Former;
 pub use options::{Options, ReplayError, Speed};
 use plan::{Plan, plan};
 use ready_file::ReadyFile;
@@ -98,6 +101,7 @@ fn show_page(running: &Running, opens: bool) -> anyhow::Result<()> {
 /// `view`: whether to open the page, for [`view`].
 async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Result<Exit> {
     let (json, serve) = (options.json, options.serve);
+    let what = what_is_replayed(&options);
     let mut shown = Ok(());
     let progress = Arc::new(Progress::default());
     let mut bar = None;
@@ -140,7 +144,7 @@ async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Resul
     };
     let has_no_map = serve && summary.reached_end && summary.maps() == 0;
     if has_no_map {
-        eprintln!("clearway: the whole drive made no map: {}", why_no_map(&summary.mount, &summary.snapshot));
+        eprintln!("clearway: the {what} made no map: {}", why_no_map(&summary.mount, &summary.snapshot));
     }
     Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
 }
@@ -183,7 +187,7 @@ pub async fn replay(
     started: impl FnOnce(&Running, &Summary),
     stop: impl Future<Output = ()>,
 ) -> Result<Summary, ReplayError> {
-    let began = Instant::now();
+    let (began, what) = (Instant::now(), what_is_replayed(&options));
     options.ready_file.as_deref().map_or(Ok(()), ReadyFile::remove_earlier)?;
     let plan = tokio::task::block_in_place(|| plan(&options))?;
     let Plan { setup, mount, extrinsics, mut timeline, bytes, boot_id, clouds } = plan;
@@ -195,7 +199,14 @@ pub async fn replay(
     timeline.faults = faults(&options, extent, &setup.config)?;
     let (handle, input) = ReplayHandle::new(state);
     let setup = Setup { replay: options.serve.then(|| handle.clone()), ..setup };
-    let mut running = Server::start(setup).await?;
+    let former = Former::keep(&options)?;
+    let mut running = match Server::start(setup).await {
+        Ok(running) => running,
+        Err(error) => {
+            former.map_or(Ok(None), |former| former.end(false))?;
+            return Err(error.into());
+        }
+    };
     let ready_file = options.ready_file.as_deref().map(|file| ReadyFile::write(file, &running)).transpose();
     let running_vehicles = running.vehicles.clone();
     let status = running_vehicles.0[0].status.clone();
@@ -240,7 +251,7 @@ pub async fn replay(
             let mut player = tokio::task::spawn_blocking(play);
             tokio::select! {
                 played = &mut player => played,
-                () = warn_without_map(&handle, &summary.mount, &status) => unreachable!("it does not end"),
+                () = warn_without_map(&handle, what, &summary.mount, &status) => unreachable!("it does not end"),
                 () = stop => {
                     handle.stop();
                     player.await
@@ -249,9 +260,19 @@ pub async fn replay(
         }
     };
     let ended = running.shutdown().await;
+    let outcome = outcome.map_err(|_| ReplayError::Engine).and_then(|played| Ok(played?));
+    let is_whole = ready_file.is_ok() && ended.is_ok() && outcome.as_ref().is_ok_and(|played| played.reached_end);
+    let new = former.map_or(Ok(None), |former| former.end(is_whole));
     ready_file?;
-    let played = outcome.map_err(|_| ReplayError::Engine)??;
+    let played = outcome?;
     ended?;
+    if let Some(new) = new? {
+        summary.notes.push(format!(
+            "the replay ended early: the file of --record is the former one, and {} the new",
+            new.display()
+        ));
+        summary.record = Some(new);
+    }
     summary.reached_end = played.reached_end;
     summary.snapshot = status.snapshot();
     summary.truncated = played.remarks.truncated;
@@ -272,13 +293,18 @@ pub async fn replay(
     Ok(summary)
 }
 
+/// What is replayed, for people.
+fn what_is_replayed(options: &Options) -> &'static str {
+    if options.from.is_some() || options.to.is_some() { "range of --from and --to" } else { "whole drive" }
+}
+
 /// Logs why a served drive has made no map, when it has ended: it may be killed there, before its summary. Does not
 /// return.
-async fn warn_without_map(replay: &ReplayHandle, mount: &Mount, status: &VehicleStatus) {
+async fn warn_without_map(replay: &ReplayHandle, what: &str, mount: &Mount, status: &VehicleStatus) {
     let has_none =
         |state: &v1::ReplayState| state.phase() == v1::ReplayPhase::Ended && state.maps.iter().all(|maps| *maps == 0);
     if replay.state().wait_for(has_none).await.is_ok() {
-        tracing::warn!("the whole drive made no map: {}", why_no_map(mount, &status.snapshot()));
+        tracing::warn!("the {what} made no map: {}", why_no_map(mount, &status.snapshot()));
     }
     std::future::pending().await
 }

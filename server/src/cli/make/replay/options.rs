@@ -38,7 +38,8 @@ pub struct Options {
     /// Record the events and the maps to this MCAP file, which must not exist.
     #[arg(long, value_name = "OUT.mcap")]
     pub record: Option<PathBuf>,
-    /// Replace the file of --record if it exists, when the new one is whole.
+    /// Replace the file of --record if it exists, when the new one is whole. If the replay ends before, the file keeps
+    /// its name, and the new one is named OUT.unfinished.mcap.
     #[arg(long, requires = "record")]
     pub force: bool,
     /// Speed of the replay: as-recorded, max, or a factor such as 0.5 [default: max; as-recorded with --serve].
@@ -150,19 +151,22 @@ impl Speed {
     }
 }
 
+/// Greatest number of seconds, about 30 years. Ours.
+const SECONDS_MAX: f64 = 1e9;
+
 /// A number of seconds after the first event.
 pub(crate) fn offset(text: &str) -> Result<f64, String> {
     match text.parse() {
-        Ok(seconds) if seconds >= 0.0 && f64::is_finite(seconds) => Ok(seconds),
-        _ => Err("0 or more seconds are allowed".into()),
+        Ok(seconds) if (0.0..=SECONDS_MAX).contains(&seconds) => Ok(seconds),
+        _ => Err("0 to 1000000000 seconds are allowed".into()),
     }
 }
 
 /// A number of seconds above 0.
 fn seconds(text: &str) -> Result<f64, String> {
     match text.parse() {
-        Ok(seconds) if seconds > 0.0 && f64::is_finite(seconds) => Ok(seconds),
-        _ => Err("a number of seconds above 0 is allowed".into()),
+        Ok(seconds) if seconds > 0.0 && seconds <= SECONDS_MAX => Ok(seconds),
+        _ => Err("a number of seconds above 0, up to 1000000000, is allowed".into()),
     }
 }
 
@@ -223,11 +227,27 @@ pub enum ReplayError {
         /// The file.
         file: PathBuf,
     },
+    /// The recording would be one of the files of a folder that is replayed.
+    #[error("--record {}: the folder {} is replayed; name a file in another folder", file.display(), folder.display())]
+    RecordsIntoInput {
+        /// The file.
+        file: PathBuf,
+        /// Its folder.
+        folder: PathBuf,
+    },
     /// The recording would replace a file, and that was not allowed.
     #[error("--record {}: the file exists and is not overwritten; name another file, or add --force", file.display())]
     RecordExists {
         /// The file.
         file: PathBuf,
+    },
+    /// The recording that --force replaces cannot be kept until the new one is whole.
+    #[error("--record {}: the file that --force replaces cannot be kept meanwhile: {source}", file.display())]
+    Former {
+        /// The file.
+        file: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
     },
     /// The point clouds cannot be written.
     #[error(transparent)]

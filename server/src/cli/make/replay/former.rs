@@ -1,0 +1,56 @@
+//! `--force` and the end of a replay -> the former recording or the new one under the name of `--record`.
+
+use std::io::{Error, ErrorKind};
+use std::path::{Path, PathBuf};
+
+use super::options::{Options, ReplayError};
+use crate::record::writer::{is_same_file, unfinished};
+
+/// The recording that `--force` replaces, under a second name until the new one is whole.
+#[derive(Debug)]
+pub(super) struct Former {
+    record: PathBuf,
+    kept: PathBuf,
+}
+
+impl Former {
+    /// Gives the file of `--record` a second name, if `--force` may replace it.
+    ///
+    /// # Errors
+    /// [`ReplayError::Former`] if the folder takes no such name.
+    pub(super) fn keep(options: &Options) -> Result<Option<Self>, ReplayError> {
+        let Some(record) = options.record.as_ref().filter(|record| options.force && record.exists()) else {
+            return Ok(None);
+        };
+        let name = record.file_name().unwrap_or_default().to_string_lossy();
+        let kept = record.with_file_name(format!(".{name}.{}.former", std::process::id()));
+        let linked = match std::fs::hard_link(record, &kept) {
+            // A file system without links.
+            Err(error) if error.kind() == ErrorKind::Unsupported || error.kind() == ErrorKind::PermissionDenied => {
+                std::fs::copy(record, &kept).map(drop)
+            }
+            linked => linked,
+        };
+        let record = record.clone();
+        linked.map_err(|source| ReplayError::Former { file: record.clone(), source })?;
+        Ok(Some(Self { record, kept }))
+    }
+
+    /// Deletes the former recording if the new one `is_whole`, and else gives it its name back. Returns then the name
+    /// of the new one, if there is one.
+    ///
+    /// # Errors
+    /// [`ReplayError::Former`] if the names cannot be changed.
+    pub(super) fn end(self, is_whole: bool) -> Result<Option<PathBuf>, ReplayError> {
+        let failed = |source: Error| ReplayError::Former { file: self.record.clone(), source };
+        let is_replaced = self.record.exists() && !is_same_file(&self.record, &self.kept);
+        if is_whole || (!is_replaced && self.record.exists()) {
+            std::fs::remove_file(&self.kept).map_err(failed)?;
+            return Ok(None);
+        }
+        let new = is_replaced.then(|| unfinished(Path::new(&self.record)));
+        new.as_ref().map_or(Ok(()), |new| std::fs::rename(&self.record, new)).map_err(failed)?;
+        std::fs::rename(&self.kept, &self.record).map_err(failed)?;
+        Ok(new)
+    }
+}
