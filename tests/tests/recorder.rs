@@ -112,6 +112,12 @@ async fn each_part_is_verifiable_alone_and_together_they_hold_everything() {
     assert_eq!(maps.len() as u64, made * fixture::LAYERS);
     assert_eq!(events.len() as u64, recorder.durable_events["car"]);
     assert_eq!(events.last().copied(), Some(events.len() as u64 - 1), "no event is missing");
+    // The later parts begin with events of the part before, which a replay passes over.
+    let other = tempfile::tempdir().unwrap();
+    let parts = folder.path().to_str().unwrap();
+    let replay = clearway_tests::run(other.path(), "clearway", &["replay", parts, "--record", "whole.mcap"]);
+    assert!(replay.status.success(), "{}", String::from_utf8_lossy(&replay.stderr));
+    assert!(contents(&other.path().join("whole.mcap")) == (events, maps), "the parts are one drive");
 }
 
 #[tokio::test(flavor = "multi_thread")]

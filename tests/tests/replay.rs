@@ -225,6 +225,17 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
     assert!(success, "{error}");
     assert!(verify(&at("old.mcap")).unwrap().is_good());
     assert!(!at("old.unfinished.mcap").exists());
+    assert!(std::process::Command::new("mkfifo").arg(at("pipe")).status().unwrap().success());
+    let (success, error) = replay(&["a.mcap", "--record", "pipe", "--force"]);
+    assert!(!success && error.contains("a pipe or a device; name a file"), "{error}");
+    let (success, error) = replay(&["a.mcap", "--serve", "--any-port", "--exit-at-end", "--ready-file", "a.mcap"]);
+    assert!(!success && error.contains("not that of an earlier replay"), "{error}");
+    let verify = clearway_tests::run(folder.path(), "clearway", &["verify", "a.mcap", "--junit", "a.mcap"]);
+    assert!(String::from_utf8_lossy(&verify.stderr).contains("the file exists and is no XML"), "{verify:?}");
+    assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "the recording is unchanged");
+    std::fs::write(at("c.part-0002.mcap"), "old").unwrap();
+    let (success, error) = replay(&["a.mcap", "--record", "c.mcap"]);
+    assert!(!success && error.contains("parts of an earlier recording of this name"), "{error}");
     let (success, error) = replay(&[".", "--record", "b.mcap"]);
     assert!(!success && error.contains("the folder . is replayed"), "{error}");
 }
@@ -236,6 +247,8 @@ fn a_replay_that_ends_early_does_not_replace_a_recording() {
     let golden = clearway_tests::workspace().join("tests/golden/drive.mcap");
     let (ready, old) = (at("ready.json"), at("old.mcap"));
     std::fs::write(&old, "old").unwrap();
+    // What a replay that was killed has left; no process has this number.
+    std::fs::hard_link(&old, at(".old.mcap.4194305.former")).unwrap();
     let mut replay = Command::new(clearway_tests::binaries().join("clearway"));
     replay.arg("replay").arg(&golden).args(["--serve", "--paused", "--any-port", "--force", "--record"]).arg(&old);
     let mut replay =
@@ -250,9 +263,9 @@ fn a_replay_that_ends_early_does_not_replace_a_recording() {
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(std::fs::read(&old).unwrap(), b"old");
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(said.contains("old.unfinished.mcap"), "{said}");
-    assert!(verify(&at("old.unfinished.mcap")).unwrap().incomplete.is_none());
+    assert!(said.contains("old.early.mcap"), "{said}");
+    assert!(verify(&at("old.early.mcap")).unwrap().incomplete.is_none());
     let mut names: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|of| of.unwrap().file_name()).collect();
     names.sort();
-    assert_eq!(names, ["old.mcap", "old.unfinished.mcap"], "nothing else is left");
+    assert_eq!(names, ["old.early.mcap", "old.mcap"], "nothing else is left");
 }

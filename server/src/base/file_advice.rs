@@ -23,6 +23,8 @@ pub fn advised(file: &Path, error: Error) -> Error {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
     let kind = error.kind();
     let advice = match kind {
+        // It has a text of ours.
+        _ if error.get_ref().is_some() => return error,
         ErrorKind::NotFound => match folder.filter(|folder| !folder.exists()) {
             Some(folder) => format!("No such file: the folder {} does not exist", folder.display()),
             None => "No such file".to_owned(),

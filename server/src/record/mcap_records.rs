@@ -288,7 +288,8 @@ impl McapRecords {
                 self.consume(self.bytes().len());
             }
             if self.offset > end {
-                self.add_lost((end, self.offset), &"bytes after the end of the recording");
+                let reason = "bytes after the end of the recording".into();
+                self.lost.push(LostPart::new((end, self.offset), reason, true));
             }
         }
         Ok(())

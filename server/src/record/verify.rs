@@ -131,10 +131,11 @@ pub enum VerifyError {
 }
 
 impl Report {
-    /// True if the readable part of the recording has events, every map in it is the map of its events, and the
-    /// recorder has dropped nothing.
+    /// True if the readable part of the recording has events, every map in it is the map of its events, at least one of
+    /// them can be judged, and the recorder has dropped nothing.
     pub fn is_good(&self) -> bool {
-        self.different == 0 && self.events > 0 && self.dropped == 0
+        let is_judged = self.equal > 0 || self.unjudged == 0;
+        self.different == 0 && self.events > 0 && self.dropped == 0 && is_judged
     }
 
     /// The report as one JSON object.

@@ -43,6 +43,15 @@ pub struct Source {
     next_event: u64,
 }
 
+/// What the next file continues: the bag or the recording of the files before it.
+#[derive(Default)]
+pub struct Before {
+    /// Decodes the ROS messages of several files of one bag.
+    decoder: Option<TopicDecoder>,
+    /// Boot id and number of the newest part of a recording, and the sequence of the event after its newest one.
+    part: Option<(u64, u64, u64)>,
+}
+
 /// An MCAP file cannot be read further.
 #[derive(Debug, thiserror::Error)]
 pub enum McapError {
@@ -55,15 +64,18 @@ pub enum McapError {
 }
 
 impl Source {
-    /// Opens the file. `decoder` is that of the file before, so that several files of one bag are decoded as one;
-    /// without it, the topics are chosen here.
+    /// Opens the file after those `before` it: several files of one bag are decoded as one, and a later part of a
+    /// recording begins with events that the part before it has, which are passed over.
     ///
     /// # Errors
     /// [`McapError::Recording`] if the file cannot be read or is not an MCAP file, [`McapError::Choice`] if it does not
     /// have a requested topic.
-    pub fn open(file: &Path, options: &McapOptions, decoder: Option<TopicDecoder>) -> Result<Self, McapError> {
+    pub fn open(file: &Path, options: &McapOptions, before: Before) -> Result<Self, McapError> {
         let recording = RecordingReader::open(file)?;
-        let (mut decoder, mut notes) = (decoder, Vec::new());
+        let (mut decoder, mut notes) = (before.decoder, Vec::new());
+        let this = recording.part().map(|part| (recording.header().boot_id, part));
+        let continues = |(boot_id, part, _): &(u64, u64, u64)| this.is_some_and(|of| of.0 == *boot_id && of.1 > *part);
+        let next_event = before.part.filter(continues).map_or(0, |(.., next_event)| next_event);
         if recording.header().config.is_some() {
             decoder = None;
         } else if decoder.is_none() {
@@ -81,7 +93,7 @@ impl Source {
             refused: RefusedMessages::new(),
             waiting: VecDeque::new(),
             is_journal: false,
-            next_event: 0,
+            next_event,
         })
     }
 
@@ -109,9 +121,10 @@ impl Source {
         std::mem::take(&mut self.refused)
     }
 
-    /// The decoder for the next file of the same bag.
-    pub fn into_decoder(self) -> Option<TopicDecoder> {
-        self.decoder
+    /// What the next file may continue.
+    pub fn into_before(self) -> Before {
+        let part = self.recording.part().map(|part| (self.recording.header().boot_id, part, self.next_event));
+        Before { decoder: self.decoder, part: part.filter(|_| self.is_journal) }
     }
 
     fn push(&mut self, message: RecordedMessage) {

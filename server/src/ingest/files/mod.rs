@@ -23,10 +23,9 @@ use clearway_mapping::scan_file::ScanFormat;
 
 use crate::base::file_advice::{advised, open_to_read};
 use crate::ingest::queue::Reading;
-use crate::ingest::ros::decoder::TopicDecoder;
 use capture::CaptureError;
 use kitti::ScanError;
-use mcap::{McapError, McapOptions, RefusedMessages};
+use mcap::{Before, McapError, McapOptions, RefusedMessages};
 
 /// The kind of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -98,8 +97,8 @@ pub struct Truncated {
 pub struct Readings {
     files: VecDeque<(PathBuf, Kind)>,
     options: McapOptions,
-    /// The decoder for the next file of a bag.
-    decoder: Option<TopicDecoder>,
+    /// What the next file may continue.
+    before: Before,
     /// Refused messages of closed files that are not reported to the event queue yet.
     refused: RefusedMessages,
     open: Option<Open>,
@@ -139,7 +138,7 @@ impl Readings {
         Ok(Self {
             files: all,
             options,
-            decoder: None,
+            before: Before::default(),
             refused: RefusedMessages::new(),
             open: None,
             scans: 0,
@@ -220,7 +219,7 @@ impl Readings {
             match kind {
                 Kind::Capture => self.open = Some(Open::Capture(file.clone(), Box::new(capture::Source::open(&file)?))),
                 Kind::Mcap => {
-                    let source = mcap::Source::open(&file, &self.options, self.decoder.take())?;
+                    let source = mcap::Source::open(&file, &self.options, std::mem::take(&mut self.before))?;
                     self.open = Some(Open::Mcap(file, Box::new(source)));
                 }
                 Kind::Scan => {
@@ -279,7 +278,7 @@ impl Readings {
                 }
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
                 add(&mut self.refused, source.drain_refused());
-                self.decoder = source.into_decoder();
+                self.before = source.into_before();
             }
         }
     }

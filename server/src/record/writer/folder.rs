@@ -116,7 +116,11 @@ impl Folder {
         }
         fs::create_dir_all(folder.parent())?;
         if !folder.replaces && is_taken(&folder.file) {
-            return Err(ErrorKind::AlreadyExists.into());
+            let taken = match folder.file.symlink_metadata() {
+                Ok(_) => "the file exists and is not overwritten; delete it, or name another file",
+                Err(_) => "parts of an earlier recording of this name are beside it; name another file",
+            };
+            return Err(io::Error::new(ErrorKind::AlreadyExists, taken));
         }
         for left in folder.list().into_iter().filter(|part| part.is_left) {
             tracing::warn!(file = left.file, bytes = left.bytes, "an earlier run has left this part unfinished");

@@ -113,6 +113,7 @@ pub fn run(options: &Options) -> Result<Exit> {
     if let (Some(_), Check::Verify) = (&options.change.pictures, &check) {
         return Err(crate::cli::shared::output::usage_error("--pictures needs --config, --set or --against"));
     }
+    options.junit.as_deref().map_or(Ok(()), report::check_junit)?;
     let jobs = options.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
     let mut results = match files::find(&options.files, options.shard) {
         Ok(files) => checked::check_all(&files, &check, jobs),

@@ -1,7 +1,11 @@
 //! The results of all files for programs: one JSON object, or JUnit XML.
 
 use std::fmt::Write as _;
+use std::fs::File;
+use std::io::Read as _;
+use std::path::Path;
 
+use anyhow::{Context as _, Result, bail};
 use serde_json::{Value, json};
 
 use super::checked::{Checked, Outcome};
@@ -18,6 +22,7 @@ pub fn reason(outcome: &Outcome) -> String {
                 Some(first) => format!("{}: {first}", counted(report.different, "difference")),
                 None if report.events == 0 => "no event, so nothing is verified".to_owned(),
                 None if report.recorded == RecordedMaps::None => "the events are whole; no map is recorded".to_owned(),
+                None if report.equal == 0 && report.unjudged > 0 => "no map can be judged".to_owned(),
                 None if report.maps + report.equal == 0 => "the events are whole; no map follows from them".to_owned(),
                 None => "equal".to_owned(),
             };
@@ -122,6 +127,24 @@ fn comparison_json(comparison: &Comparison) -> Value {
         "layers": comparison.layers.iter().map(layer).collect::<Vec<_>>(),
         "worst": comparison.worst.iter().map(worst).collect::<Vec<_>>(),
     })
+}
+
+/// Refuses to replace a file that is no XML.
+///
+/// # Errors
+/// If it exists and is neither empty nor XML.
+pub fn check_junit(file: &Path) -> Result<()> {
+    if !file.is_file() {
+        return Ok(());
+    }
+    let mut start = Vec::new();
+    File::open(file)
+        .and_then(|open| open.take(5).read_to_end(&mut start))
+        .with_context(|| file.display().to_string())?;
+    if !start.is_empty() && start != b"<?xml" {
+        bail!("--junit {}: the file exists and is no XML, so it is not replaced; name another file", file.display());
+    }
+    Ok(())
 }
 
 /// All results as JUnit XML: one test case for each file; a difference is a failure, a file that is not whole

@@ -4,7 +4,7 @@ use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use super::options::{Options, ReplayError};
-use crate::record::writer::{is_same_file, unfinished};
+use crate::record::writer::{is_same_file, next_free_name};
 
 /// The recording that `--force` replaces, under a second name until the new one is whole.
 #[derive(Debug)]
@@ -24,6 +24,7 @@ impl Former {
         };
         let name = record.file_name().unwrap_or_default().to_string_lossy();
         let kept = record.with_file_name(format!(".{name}.{}.former", std::process::id()));
+        remove_left(record, &name);
         let linked = match std::fs::hard_link(record, &kept) {
             // A file system without links.
             Err(error) if error.kind() == ErrorKind::Unsupported || error.kind() == ErrorKind::PermissionDenied => {
@@ -48,9 +49,26 @@ impl Former {
             std::fs::remove_file(&self.kept).map_err(failed)?;
             return Ok(None);
         }
-        let new = is_replaced.then(|| unfinished(Path::new(&self.record)));
+        let new = is_replaced.then(|| next_free_name(&self.record.with_extension("early.mcap")));
         new.as_ref().map_or(Ok(()), |new| std::fs::rename(&self.record, new)).map_err(failed)?;
         std::fs::rename(&self.kept, &self.record).map_err(failed)?;
         Ok(new)
+    }
+}
+
+/// Removes the second names of `record` that killed replays have left, and names former recordings that they have left.
+fn remove_left(record: &Path, name: &str) {
+    let folder = record.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    for entry in std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok) {
+        let file_name = entry.file_name().to_string_lossy().into_owned();
+        let process = file_name.strip_prefix(&format!(".{name}.")).and_then(|rest| rest.strip_suffix(".former"));
+        if process.is_none_or(|process| Path::new("/proc").join(process).exists()) {
+            continue;
+        }
+        let left = entry.path();
+        let removed = is_same_file(&left, record).then(|| std::fs::remove_file(&left));
+        if !removed.is_some_and(|removed| removed.is_ok()) {
+            tracing::warn!(file = %left.display(), "a replay that was killed has left the recording that it replaced");
+        }
     }
 }

@@ -39,7 +39,7 @@ pub struct Options {
     #[arg(long, value_name = "OUT.mcap")]
     pub record: Option<PathBuf>,
     /// Replace the file of --record if it exists, when the new one is whole. If the replay ends before, the file keeps
-    /// its name, and the new one is named OUT.unfinished.mcap.
+    /// its name, and the new one is named OUT.early.mcap.
     #[arg(long, requires = "record")]
     pub force: bool,
     /// Speed of the replay: as-recorded, max, or a factor such as 0.5 [default: max; as-recorded with --serve].
@@ -110,6 +110,7 @@ pub struct Options {
     #[arg(long, value_name = "N", requires = "serve")]
     pub wait_readers: Option<u32>,
     /// Write the process id and the addresses to this file as JSON once readers can connect; it is removed at the end.
+    /// Only the file of an earlier replay, or an empty one, is replaced.
     #[arg(long, value_name = "FILE.json", requires = "serve")]
     pub ready_file: Option<PathBuf>,
     /// Listen on free ports of this machine only; --ready-file and the log say which.
@@ -224,6 +225,12 @@ pub enum ReplayError {
     /// The recording would replace a file that is replayed.
     #[error("--record {}: this file is replayed; name another file", file.display())]
     RecordsInput {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The recording would replace a folder, a pipe or a device.
+    #[error("--record {}: this is a folder, a pipe or a device; name a file", file.display())]
+    RecordNoFile {
         /// The file.
         file: PathBuf,
     },

@@ -186,6 +186,9 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
     if options.files.iter().any(|file| is_same_file(file, record) || is_in(file)) {
         return Err(ReplayError::RecordsInput { file: record.clone() });
     }
+    if record.metadata().is_ok_and(|of| !of.is_file()) {
+        return Err(ReplayError::RecordNoFile { file: record.clone() });
+    }
     let folder = record.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if let Some(folder) = options.files.iter().find(|file| is_same_file(file, folder)) {
         return Err(ReplayError::RecordsIntoInput { file: record.clone(), folder: folder.clone() });

@@ -1,11 +1,15 @@
 //! The file of `--ready-file`: tells the program that started the replay how to reach it.
 
+use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::options::ReplayError;
 use crate::server::Running;
+
+/// Greatest length of the file. Ours: it has a line for each vehicle.
+const BYTES_MAX: u64 = 1 << 20;
 
 /// The file, which exists while the replay can be reached.
 pub struct ReadyFile(PathBuf);
@@ -14,14 +18,26 @@ impl ReadyFile {
     /// Removes the file of an earlier replay.
     ///
     /// # Errors
-    /// [`ReplayError::ReadyFile`] if it cannot be removed.
+    /// [`ReplayError::ReadyFile`] if it is another file, or cannot be removed.
     pub fn remove_earlier(file: &Path) -> Result<(), ReplayError> {
-        match std::fs::remove_file(file) {
-            Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
-                Err(ReplayError::ReadyFile { file: file.to_owned(), source })
-            }
-            _ => Ok(()),
+        let wrong = |source| ReplayError::ReadyFile { file: file.to_owned(), source };
+        let other = || {
+            let advice = "the file exists and is not that of an earlier replay; name another file";
+            wrong(Error::new(ErrorKind::AlreadyExists, advice))
+        };
+        let metadata = match file.metadata() {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+            metadata => metadata.map_err(wrong)?,
+        };
+        if !metadata.is_file() || metadata.len() > BYTES_MAX {
+            return Err(other());
         }
+        let text = std::fs::read(file).map_err(wrong)?;
+        let has_pid = || serde_json::from_slice::<Value>(&text).is_ok_and(|document| document.get("pid").is_some());
+        if !text.is_empty() && !has_pid() {
+            return Err(other());
+        }
+        std::fs::remove_file(file).map_err(wrong)
     }
 
     /// Writes the process id and the addresses of the running server as one JSON object: `pid`, `grpc` (`HOST:PORT`),
