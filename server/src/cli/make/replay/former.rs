@@ -67,7 +67,7 @@ fn remove_left(record: &Path, name: &str) {
         }
         let left = entry.path();
         let removed = is_same_file(&left, record).then(|| std::fs::remove_file(&left));
-        if !removed.is_some_and(|removed| removed.is_ok()) {
+        if removed.is_none_or(|removed| removed.is_err()) {
             tracing::warn!(file = %left.display(), "a replay that was killed has left the recording that it replaced");
         }
     }
