@@ -247,13 +247,23 @@ fn a_repair_without_a_loss_ends_with_success() {
 fn a_record_with_a_wrong_length_costs_that_record() {
     let all = McapReader::open(&golden()).unwrap().count();
     for kind in [op::HEADER, op::METADATA, op::ATTACHMENT] {
-        // The third byte of its length: the record then ends within the file, some chunks later.
-        let (said, code) = repaired(|bytes| {
-            let record = records(bytes, kind)[0];
-            bytes[record + 3] ^= 1;
-        });
-        assert!(code == Some(1) && said.contains(&format!("\"messages\": {all},")), "{kind}, {code:?}: {said}");
+        // Its length: the record then ends some bytes, or some chunks, before or after its end.
+        for (byte, bit) in [(1, 0), (1, 1), (1, 3), (1, 7), (2, 0), (2, 5), (3, 0)] {
+            let (said, code) = repaired(|bytes| {
+                let record = records(bytes, kind)[0];
+                bytes[record + byte] ^= 1 << bit;
+            });
+            let has_all = said.contains(&format!("\"messages\": {all},"));
+            assert!(code == Some(1) && has_all, "{kind}, byte {byte}, bit {bit}, {code:?}: {said}");
+        }
     }
+    // One byte too short, and the byte behind it looks like the kind of a long record of another program.
+    let (said, code) = repaired(|bytes| {
+        let (header, metadata) = (records(bytes, op::HEADER)[0], records(bytes, op::METADATA)[0]);
+        bytes[header + 1] -= 1;
+        bytes[metadata - 1] = 0x86;
+    });
+    assert!(code == Some(1) && said.contains(&format!("\"messages\": {all},")), "{code:?}: {said}");
 }
 
 #[test]

@@ -224,7 +224,7 @@ impl McapRecords {
                 self.private = Some((from, self.offset)).filter(|_| opcode >= PRIVATE);
                 Ok(record)
             }
-            Err((reason, _)) if !self.head_at(end)? => {
+            Err((reason, _)) if !self.goes_on_at(opcode, end)? => {
                 self.search(&reason)?;
                 Ok(None)
             }
@@ -376,6 +376,13 @@ impl McapRecords {
         let fields = &self.bytes()[at..end];
         let (name, data_length) = (&fields[32..32 + name_length], u64_at(fields, 32 + name_length));
         Ok(COMPRESSIONS.contains(&name) && data_length == (length - (end - at).min(length)) as u64)
+    }
+
+    /// True if the file goes on `at` bytes after the current position, behind a damaged record of this kind. Nothing but
+    /// its length says so of a record that is no chunk, and the length may be what is damaged.
+    fn goes_on_at(&mut self, opcode: u8, at: usize) -> Result<bool, RecordsError> {
+        let is_alone = self.section == Section::Data && opcode != op::CHUNK && self.fill(at + RECORD_HEAD_BYTES)?;
+        Ok(self.head_at(at)? && (!is_alone || self.is_record_at(at)?))
     }
 
     /// True if a possible head of a record, or the end of the file, is `at` bytes after the current position.
