@@ -378,8 +378,8 @@ impl McapRecords {
         Ok(COMPRESSIONS.contains(&name) && data_length == (length - (end - at).min(length)) as u64)
     }
 
-    /// True if the file goes on `at` bytes after the current position, behind a damaged record of this kind. Nothing but
-    /// its length says so of a record that is no chunk, and the length may be what is damaged.
+    /// True if the file goes on `at` bytes after the current position, behind a damaged record of this kind. If it is
+    /// no chunk, only its length says where it ends, and the length may be what is damaged.
     fn goes_on_at(&mut self, opcode: u8, at: usize) -> Result<bool, RecordsError> {
         let is_alone = self.section == Section::Data && opcode != op::CHUNK && self.fill(at + RECORD_HEAD_BYTES)?;
         Ok(self.head_at(at)? && (!is_alone || self.is_record_at(at)?))
