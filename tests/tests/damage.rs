@@ -244,6 +244,32 @@ fn a_repair_without_a_loss_ends_with_success() {
 }
 
 #[test]
+fn a_second_recording_behind_the_end_is_a_loss() {
+    let (said, code) = repaired(|bytes| bytes.extend(bytes.clone()));
+    assert!(code == Some(1) && said.contains("bytes after the end of the recording"), "{code:?}: {said}");
+}
+
+#[test]
+fn a_recording_of_which_no_map_can_be_judged_is_not_called_equal() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut bytes = in_chunks();
+    // The number of the part in the metadata: as if the first part were missing.
+    let part = bytes.windows(9).position(|text| text == b"part\x01\0\0\x001").unwrap() + 8;
+    bytes[part] = b'0';
+    std::fs::write(folder.path().join("damaged.mcap"), &bytes).unwrap();
+    repair(&folder.path().join("damaged.mcap"), &folder.path().join("repaired.mcap")).unwrap();
+    let output = run(folder.path(), "clearway", &["verify", "repaired.mcap"]);
+    let said = text(&output.stdout);
+    assert!(output.status.code() == Some(2) && said.contains("no map can be judged"), "{said}");
+    // The first map needs more events.
+    let golden = golden();
+    let replay = &["replay", golden.to_str().unwrap(), "--to", "0.01", "--record", "short.mcap"];
+    assert!(run(folder.path(), "clearway", replay).status.success());
+    let said = text(&run(folder.path(), "clearway", &["verify", "short.mcap"]).stdout);
+    assert!(said.contains("no map follows from them") && said.contains("1 file: no map was compared"), "{said}");
+}
+
+#[test]
 fn a_record_with_a_wrong_length_costs_that_record() {
     let all = McapReader::open(&golden()).unwrap().count();
     for kind in [op::HEADER, op::METADATA, op::ATTACHMENT] {

@@ -48,8 +48,15 @@ pub struct Source {
 pub struct Before {
     /// Decodes the ROS messages of several files of one bag.
     decoder: Option<TopicDecoder>,
-    /// Boot id and number of the newest part of a recording, and the sequence of the event after its newest one.
-    part: Option<(u64, u64, u64)>,
+    part: Option<Part>,
+}
+
+/// A part of a recording that was read.
+struct Part {
+    boot_id: u64,
+    number: u64,
+    /// Sequence of the event after its newest one.
+    next_event: u64,
 }
 
 /// An MCAP file cannot be read further.
@@ -73,9 +80,10 @@ impl Source {
     pub fn open(file: &Path, options: &McapOptions, before: Before) -> Result<Self, McapError> {
         let recording = RecordingReader::open(file)?;
         let (mut decoder, mut notes) = (before.decoder, Vec::new());
-        let this = recording.part().map(|part| (recording.header().boot_id, part));
-        let continues = |(boot_id, part, _): &(u64, u64, u64)| this.is_some_and(|of| of.0 == *boot_id && of.1 > *part);
-        let next_event = before.part.filter(continues).map_or(0, |(.., next_event)| next_event);
+        let is_later_part = |before: &Part| {
+            before.boot_id == recording.header().boot_id && recording.part().is_some_and(|part| part > before.number)
+        };
+        let next_event = before.part.filter(is_later_part).map_or(0, |before| before.next_event);
         if recording.header().config.is_some() {
             decoder = None;
         } else if decoder.is_none() {
@@ -123,7 +131,8 @@ impl Source {
 
     /// What the next file may continue.
     pub fn into_before(self) -> Before {
-        let part = self.recording.part().map(|part| (self.recording.header().boot_id, part, self.next_event));
+        let (boot_id, next_event) = (self.recording.header().boot_id, self.next_event);
+        let part = self.recording.part().map(|number| Part { boot_id, number, next_event });
         Before { decoder: self.decoder, part: part.filter(|_| self.is_journal) }
     }
 

@@ -116,10 +116,10 @@ impl Folder {
         }
         fs::create_dir_all(folder.parent())?;
         if !folder.replaces && is_taken(&folder.file) {
-            let taken = match folder.file.symlink_metadata() {
-                Ok(_) => "the file exists and is not overwritten; delete it, or name another file",
-                Err(_) => "parts of an earlier recording of this name are beside it; name another file",
-            };
+            if folder.file.symlink_metadata().is_ok() {
+                return Err(ErrorKind::AlreadyExists.into());
+            }
+            let taken = "parts of an earlier recording of this name are beside it; name another file";
             return Err(io::Error::new(ErrorKind::AlreadyExists, taken));
         }
         for left in folder.list().into_iter().filter(|part| part.is_left) {
@@ -256,7 +256,7 @@ impl Files for Folder {
     }
 
     fn path(&self, part: u64) -> PathBuf {
-        unfinished(&self.finished(part))
+        with_infix(&self.finished(part), "unfinished")
     }
 
     fn keep(&mut self, parts: &[u64], name: &str) -> io::Result<Vec<PathBuf>> {
@@ -366,18 +366,13 @@ fn with_infix(file: &Path, infix: &str) -> PathBuf {
     file.with_file_name(format!("{stem}.{infix}.{extension}"))
 }
 
-/// The name of a file until it is whole.
-pub fn unfinished(file: &Path) -> PathBuf {
-    with_infix(file, "unfinished")
-}
-
 /// True if a recording to `file` would meet a file of an earlier one: its first part or, if that was deleted, another.
 fn is_taken(file: &Path) -> bool {
     let parts = with_infix(file, "part-").file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let name = |entry: io::Result<fs::DirEntry>| Some(entry.ok()?.file_name().to_string_lossy().into_owned());
     let mut names = fs::read_dir(parent_of(file)).into_iter().flatten().filter_map(name);
     file.symlink_metadata().is_ok()
-        || unfinished(file).exists()
+        || with_infix(file, "unfinished").exists()
         || names.any(|name| name.starts_with(&parts) && is_part_of(file, Path::new(&name)))
 }
 

@@ -35,7 +35,8 @@ mod table;
 #[derive(Args)]
 #[command(
     after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
-no event or no map to compare, or is another drive than that of --against or has no map in common with it, 3 wrong use.
+no event or no map that can be judged, or is another drive than that of --against or has no map in common with it, 3
+wrong use. A file whose events make no map is no fault; its line says so.
 
 Examples:
   clearway verify drive.mcap

@@ -1,6 +1,6 @@
 //! `--force` and the end of a replay -> the former recording or the new one under the name of `--record`.
 
-use std::io::{Error, ErrorKind};
+use std::io::Error;
 use std::path::{Path, PathBuf};
 
 use super::options::{Options, ReplayError};
@@ -17,7 +17,7 @@ impl Former {
     /// Gives the file of `--record` a second name, if `--force` may replace it.
     ///
     /// # Errors
-    /// [`ReplayError::Former`] if the folder takes no such name.
+    /// [`ReplayError::Former`] if it cannot have one: on a file system without links, or in a read-only folder.
     pub(super) fn keep(options: &Options) -> Result<Option<Self>, ReplayError> {
         let Some(record) = options.record.as_ref().filter(|record| options.force && record.exists()) else {
             return Ok(None);
@@ -25,27 +25,20 @@ impl Former {
         let name = record.file_name().unwrap_or_default().to_string_lossy();
         let kept = record.with_file_name(format!(".{name}.{}.former", std::process::id()));
         remove_left(record, &name);
-        let linked = match std::fs::hard_link(record, &kept) {
-            // A file system without links.
-            Err(error) if error.kind() == ErrorKind::Unsupported || error.kind() == ErrorKind::PermissionDenied => {
-                std::fs::copy(record, &kept).map(drop)
-            }
-            linked => linked,
-        };
-        let record = record.clone();
-        linked.map_err(|source| ReplayError::Former { file: record.clone(), source })?;
-        Ok(Some(Self { record, kept }))
+        std::fs::hard_link(record, &kept).map_err(|source| ReplayError::Former { file: record.clone(), source })?;
+        Ok(Some(Self { record: record.clone(), kept }))
     }
 
-    /// Deletes the former recording if the new one `is_whole`, and else gives it its name back. Returns then the name
-    /// of the new one, if there is one.
+    /// Deletes the former recording if the new one `is_whole`. Else gives the former its name back, and returns what
+    /// the new one is named instead, if there is a new one.
     ///
     /// # Errors
     /// [`ReplayError::Former`] if the names cannot be changed.
     pub(super) fn end(self, is_whole: bool) -> Result<Option<PathBuf>, ReplayError> {
         let failed = |source: Error| ReplayError::Former { file: self.record.clone(), source };
         let is_replaced = self.record.exists() && !is_same_file(&self.record, &self.kept);
-        if is_whole || (!is_replaced && self.record.exists()) {
+        let is_former = !is_replaced && self.record.exists();
+        if is_whole || is_former {
             std::fs::remove_file(&self.kept).map_err(failed)?;
             return Ok(None);
         }

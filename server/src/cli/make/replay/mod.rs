@@ -268,7 +268,7 @@ pub async fn replay(
     ended?;
     if let Some(new) = new? {
         summary.notes.push(format!(
-            "the replay ended early: the file of --record is the former one, and {} the new",
+            "the replay ended early: the file of --record is still the former recording, the new one is {}",
             new.display()
         ));
         summary.record = Some(new);
