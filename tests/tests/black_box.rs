@@ -358,4 +358,6 @@ fn a_part_without_a_message_gets_no_successor() {
         writer.write_next(began + Duration::from_secs(second));
     }
     assert_eq!(parts(), 2, "the time counts from the first message");
+    writer.finish();
+    assert_eq!(parts(), 1, "a part that no vehicle has begun holds nothing that the part before it lacks");
 }

@@ -229,6 +229,19 @@ fn a_repair_without_a_loss_ends_with_success() {
     });
     assert!(said.contains("a message index does not agree with its chunk"), "{said}");
     assert!(code == Some(0) && said.contains(&format!("\"messages\": {all},")), "{code:?}: {said}");
+    // Any bit of an index.
+    let bytes = in_chunks();
+    let indexes = records(&bytes, op::MESSAGE_INDEX);
+    let lengths = indexes.windows(2).skip(2).map(|pair| (pair[1] - pair[0], pair[0]));
+    let (length, index) = lengths.min().unwrap();
+    for bit in 0..length * 8 {
+        let mut bytes = bytes.clone();
+        bytes[index + bit / 8] ^= 1 << (bit % 8);
+        let mut reader = McapReader::from_source(Path::new("damaged.mcap"), std::io::Cursor::new(bytes)).unwrap();
+        assert_eq!(reader.by_ref().count(), all, "bit {bit}");
+        let damages = reader.damages();
+        assert!(damages.len() == 1 && !damages[0].is_loss, "bit {bit}: {damages:?}");
+    }
     let (said, code) = repaired(|bytes| {
         let statistics = records(bytes, op::STATISTICS)[0];
         bytes[statistics + 9] ^= 1;
@@ -270,6 +283,39 @@ fn a_recording_of_which_no_map_can_be_judged_is_not_called_equal() {
 }
 
 #[test]
+fn a_recording_without_its_configuration_is_still_called_a_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut bytes = in_chunks();
+    let attachment = records(&bytes, op::ATTACHMENT)[0];
+    bytes[attachment + 100] ^= 1;
+    std::fs::write(folder.path().join("damaged.mcap"), &bytes).unwrap();
+    let repaired = run(folder.path(), "clearway", &["repair", "damaged.mcap", "repaired.mcap"]);
+    assert!(text(&repaired.stdout).contains("repaired.mcap has no configuration, so verify cannot"), "{repaired:?}");
+    for name in ["damaged.mcap", "repaired.mcap"] {
+        let output = run(folder.path(), "clearway", &["verify", name]);
+        let said = text(&output.stderr);
+        assert!(output.status.code() == Some(2) && said.contains("config.toml: it is lost (bytes"), "{name}: {said}");
+    }
+}
+
+#[test]
+fn messages_that_were_cut_out_of_a_recording_are_no_difference() {
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = in_chunks();
+    let chunks = records(&bytes, op::CHUNK);
+    for cut in [2, 5, chunks.len() - 2] {
+        let (mut rest, file) = (bytes.clone(), folder.path().join("rest.mcap"));
+        rest.drain(chunks[cut]..chunks[cut + 1]);
+        std::fs::write(&file, &rest).unwrap();
+        let report = verify(&file).unwrap();
+        assert!(report.different == 0 && report.differences.is_empty(), "chunk {cut}: {report:?}");
+        assert!(report.incomplete.is_some(), "chunk {cut}: {report:?}");
+        let output = run(folder.path(), "clearway", &["verify", "rest.mcap"]);
+        assert_eq!(output.status.code(), Some(2), "chunk {cut}: {}", text(&output.stdout));
+    }
+}
+
+#[test]
 fn a_record_with_a_wrong_length_costs_that_record() {
     let all = McapReader::open(&golden()).unwrap().count();
     for kind in [op::HEADER, op::METADATA, op::ATTACHMENT] {
@@ -300,6 +346,7 @@ fn a_repair_names_a_lost_attachment_and_changed_metadata() {
     });
     assert!(said.contains("the attachment \\\"config.toml\\\"") && said.contains("CRC"), "{said}");
     assert!(code == Some(1) && said.contains("\"lost_messages\": 0"), "{code:?}: {said}");
+    assert!(said.contains("\"lacks_config\": true"), "{said}");
     let (said, code) = repaired(|bytes| {
         let key = bytes.windows(7).position(|text| text == b"boot_id").unwrap();
         // The first digit of its value, behind the value's length.
@@ -381,6 +428,12 @@ fn a_recording_of_a_later_version_is_refused_by_name() {
         writer.finish().unwrap();
         file
     };
+    // A digit of the format has changed: this version has never written it.
+    let (said, code) = repaired(|bytes| {
+        let format = bytes.windows(6).position(|text| text == b"format").unwrap();
+        bytes[format + 6 + 4] ^= 2;
+    });
+    assert!(code == Some(1) && said.contains("which clearway 0.1.0 has never written"), "{code:?}: {said}");
     let refused = |file: &Path| RecordingReader::open(file).err().expect("refused").to_string();
     let later = refused(&write("later.mcap", &[("format", "2"), ("version", "0.7.0")], "clearway.v1.Event"));
     assert!(later.contains("format 2") && later.contains("0.7.0") && later.contains("later.mcap"), "{later}");

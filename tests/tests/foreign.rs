@@ -151,3 +151,31 @@ fn a_damaged_bag_is_named_and_is_read_up_to_the_damage() {
     let error = McapReader::open(&other).err().expect("no bag").to_string();
     assert!(error.contains("other.db3") && error.contains("no such table: topics"), "{error}");
 }
+
+#[test]
+fn of_a_bag_with_a_damaged_page_the_messages_that_cannot_be_read_are_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bag_0.db3");
+    let bag = Connection::open(&file).unwrap();
+    let tables = "CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+        CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+        CREATE INDEX timestamp_idx ON messages (timestamp);
+        INSERT INTO topics VALUES (1, '/points', 'sensor_msgs/msg/PointCloud2', 'cdr');";
+    bag.execute_batch(tables).unwrap();
+    for message in 0..100 {
+        let data = [message; 20_000];
+        bag.execute("INSERT INTO messages VALUES (?1, 1, ?2, ?3)", (message, i64::from(message) + 1, &data[..]))
+            .unwrap();
+    }
+    drop(bag);
+    let mut bytes = std::fs::read(&file).unwrap();
+    // The pages of 4096 bytes that follow the first one of a message begin with the number of the next page.
+    let page = bytes.chunks(4096).position(|page| page[4..].iter().all(|byte| *byte == 70)).unwrap();
+    bytes[page * 4096..(page + 1) * 4096].fill(0);
+    std::fs::write(&file, &bytes).unwrap();
+    let mut reader = McapReader::open(&file).unwrap();
+    let read = reader.by_ref().filter_map(Result::ok).count();
+    let incomplete = reader.incomplete().expect("the damage is named");
+    assert!(incomplete.contains(&format!("{} messages after the time {read}", 100 - read)), "{read}: {incomplete}");
+    assert!(read >= 64, "{read}: a batch before the damage is read");
+}

@@ -207,6 +207,11 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
     let bytes = std::fs::read(at("a.mcap")).unwrap();
     std::fs::hard_link(at("a.mcap"), at("hard.mcap")).unwrap();
     std::os::unix::fs::symlink("a.mcap", at("soft.mcap")).unwrap();
+    std::fs::write(at("old.mcap"), "old").unwrap();
+    std::os::unix::fs::symlink("old.mcap", at("other.mcap")).unwrap();
+    std::fs::write(at("later.part-0002.mcap"), "old").unwrap();
+    let busy = std::fs::File::create(at("busy.unfinished.mcap")).unwrap();
+    busy.lock().unwrap();
     for (output, force, expected) in [
         ("a.mcap", false, "this file is replayed"),
         ("a.mcap", true, "this file is replayed"),
@@ -214,13 +219,18 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
         ("soft.mcap", true, "this file is replayed"),
         ("./new/../a.mcap", true, "this file is replayed"),
         ("drive.pcap", false, "exists"),
+        ("folder/", true, "name a file"),
+        ("other.mcap", true, "this is a symbolic link; name the file that it leads to"),
+        ("later.mcap", true, "later.part-0002.mcap is a part of an earlier recording of this name"),
+        ("busy.mcap", true, "another process is writing"),
     ] {
         let force = if force { &["--force"][..] } else { &[] };
         let (success, error) = replay(&[&["a.mcap", "--record", output][..], force].concat());
         assert!(!success && error.contains(expected), "{output}: {error}");
         assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "{output}: the input is unchanged");
     }
-    std::fs::write(at("old.mcap"), "old").unwrap();
+    assert_eq!(std::fs::read(at("old.mcap")).unwrap(), b"old");
+    std::fs::remove_file(at("busy.unfinished.mcap")).unwrap();
     let (success, error) = replay(&["a.mcap", "--record", "old.mcap", "--force"]);
     assert!(success, "{error}");
     assert!(verify(&at("old.mcap")).unwrap().is_good());
@@ -235,9 +245,26 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
     assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "the recording is unchanged");
     std::fs::write(at("c.part-0002.mcap"), "old").unwrap();
     let (success, error) = replay(&["a.mcap", "--record", "c.mcap"]);
-    assert!(!success && error.contains("parts of an earlier recording of this name"), "{error}");
+    assert!(!success && error.contains("a part of an earlier recording of this name"), "{error}");
     let (success, error) = replay(&[".", "--record", "b.mcap"]);
     assert!(!success && error.contains("the folder . is replayed"), "{error}");
+}
+
+#[test]
+fn every_command_knows_a_capture_by_its_first_bytes_and_says_if_it_is_empty() {
+    let folder = tempfile::tempdir().unwrap();
+    // The header of a pcap with Ethernet frames, and nothing behind it.
+    let header = [&[0xd4, 0xc3, 0xb2, 0xa1, 2, 0, 4, 0][..], &[0; 8], &[0xff, 0xff, 0, 0, 1, 0, 0, 0]].concat();
+    std::fs::write(folder.path().join("drive.mcap"), header).unwrap();
+    for (command, more, code, expected) in [
+        ("info", &[][..], 0, "kind: capture"),
+        ("replay", &[], 2, "of 0 received"),
+        ("send", &["--to", "udp://127.0.0.1:9"], 2, "has no Velodyne datagram"),
+    ] {
+        let output = clearway_tests::run(folder.path(), "clearway", &[&[command, "drive.mcap"], more].concat());
+        let said = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+        assert!(output.status.code() == Some(code) && said.contains(expected), "{command}: {said}");
+    }
 }
 
 #[test]

@@ -10,6 +10,7 @@ use rusqlite::{Connection, OpenFlags, params};
 
 use super::chunk::RECORD_BYTES_MAX;
 use super::damage::LostPart;
+use crate::base::counted::counted;
 
 /// Number of messages that are read at once. Ours: a message of points has about a megabyte.
 const BATCH: i64 = 16;
@@ -75,11 +76,19 @@ impl BagRecords {
         {
             // The pages of a table hang on each other: what follows a damaged page cannot be found.
             self.has_ended = true;
-            let reason = format!("the messages after {} cannot be read: {error}", self.newest.0);
+            let left = self.messages_left().map_or(String::new(), |left| format!("{} ", counted(left, "message")));
+            let reason = format!("{left}after the time {} cannot be read: {error}", self.newest.0);
             let bytes = (self.bytes_read, self.bytes_read);
             self.lost.push(LostPart::new(bytes, reason, true));
         }
         self.waiting.pop_front()
+    }
+
+    /// Number of messages after the newest one, by the index of the times, if that can be read.
+    fn messages_left(&self) -> Option<u64> {
+        let count = "SELECT COUNT(*) FROM messages WHERE timestamp > ?1";
+        let left: i64 = self.bag.query_row(count, [self.newest.0], |row| row.get(0)).ok()?;
+        u64::try_from(left).ok()
     }
 
     fn read_batch(&mut self) -> rusqlite::Result<()> {

@@ -4,6 +4,7 @@
 //! chunk.
 
 use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 
 use mcap::records::{ChunkHeader, MessageIndexEntry, Record, op};
@@ -14,6 +15,10 @@ use mcap::{McapError, parse_record};
 pub(super) const RECORD_BYTES_MAX: usize = 256 << 20;
 /// Length of the head of a record: its kind (one byte) and its length (eight bytes).
 pub(super) const RECORD_HEAD_BYTES: usize = 9;
+/// Length of the fields of a chunk before its data, without the name of its compression.
+pub(super) const CHUNK_FIELDS_BYTES: usize = 40;
+/// Greatest length of fields that a later version of the format adds to a record. Ours.
+const ADDED_BYTES_MAX: usize = 1024;
 /// Length of the head of a message, its channel (two bytes), its sequence number (four) and its log time (eight).
 const MESSAGE_START_BYTES: usize = RECORD_HEAD_BYTES + 14;
 
@@ -58,6 +63,36 @@ pub(super) fn split_record<'a>(content: &mut &'a [u8]) -> Result<Record<'a>, Mca
     parse(head[0], body)
 }
 
+/// Parses a record, and refuses one whose length is not that of its fields, because its kind or its length is damaged.
+pub(super) fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
+    let record = parse(opcode, body)?;
+    let texts = |texts: &BTreeMap<String, String>| {
+        size_of::<u32>()
+            + texts.iter().map(|(key, value)| 2 * size_of::<u32>() + key.len() + value.len()).sum::<usize>()
+    };
+    // A later version of the format may add fields at the end of these, which are short.
+    let fields = match &record {
+        Record::Header(of) => Some(8 + of.profile.len() + of.library.len()),
+        Record::Schema { header, data } => Some(14 + header.name.len() + header.encoding.len() + data.len()),
+        Record::Channel(of) => Some(12 + of.topic.len() + of.message_encoding.len() + texts(&of.metadata)),
+        Record::Metadata(of) => Some(4 + of.name.len() + texts(&of.metadata)),
+        Record::Attachment { header, data, .. } => Some(36 + header.name.len() + header.media_type.len() + data.len()),
+        _ => None,
+    };
+    if fields.is_some_and(|fields| body.len() > fields + ADDED_BYTES_MAX) {
+        return Err(McapError::UnexpectedEof);
+    }
+    let length = match &record {
+        Record::Footer(_) => 20,
+        Record::DataEnd(_) => 4,
+        Record::SummaryOffset(_) => 17,
+        Record::MessageIndex(index) => 6 + 16 * index.records.len(),
+        Record::Chunk { header, data } => CHUNK_FIELDS_BYTES + header.compression.len() + data.len(),
+        _ => body.len(),
+    };
+    if length == body.len() { Ok(record) } else { Err(McapError::UnexpectedEof) }
+}
+
 /// True if an entry of a chunk's index leads to a message of this channel with the entry's time.
 pub(super) fn is_message(content: &[u8], channel_id: u16, entry: &MessageIndexEntry) -> bool {
     let at = usize::try_from(entry.offset).ok();
@@ -67,17 +102,30 @@ pub(super) fn is_message(content: &[u8], channel_id: u16, entry: &MessageIndexEn
 
 /// The body of the index of the messages of this channel, in their order in the chunk.
 pub(super) fn index_of(content: &[u8], channel_id: u16) -> Vec<u8> {
-    let (mut entries, mut at) = (Vec::new(), 0_usize);
-    while let Some(bytes) = content.get(at..).and_then(|rest| rest.get(..MESSAGE_START_BYTES)) {
-        if let Some((_, log_time)) = message_of(bytes).filter(|(channel, _)| *channel == channel_id) {
-            entries.extend(log_time.to_le_bytes());
-            entries.extend((at as u64).to_le_bytes());
-        }
-        let length = u64::from_le_bytes(bytes[1..RECORD_HEAD_BYTES].try_into().expect("eight bytes"));
-        at = at.saturating_add(RECORD_HEAD_BYTES).saturating_add(usize::try_from(length).unwrap_or(usize::MAX));
+    let mut entries = Vec::new();
+    for (at, _, log_time) in messages(content).filter(|(_, channel, _)| *channel == channel_id) {
+        entries.extend(log_time.to_le_bytes());
+        entries.extend((at as u64).to_le_bytes());
     }
     let length = u32::try_from(entries.len()).unwrap_or(u32::MAX);
     [&channel_id.to_le_bytes()[..], &length.to_le_bytes(), &entries].concat()
+}
+
+/// The channels of the messages of a chunk.
+pub(super) fn channels_of(content: &[u8]) -> BTreeSet<u16> {
+    messages(content).map(|(_, channel, _)| channel).collect()
+}
+
+/// Position, channel and log time of each message of a chunk.
+fn messages(content: &[u8]) -> impl Iterator<Item = (usize, u16, u64)> {
+    let mut next = 0_usize;
+    let heads = std::iter::from_fn(move || {
+        let (at, bytes) = (next, content.get(next..)?.get(..MESSAGE_START_BYTES)?);
+        let length = u64::from_le_bytes(bytes[1..RECORD_HEAD_BYTES].try_into().expect("eight bytes"));
+        next = at.saturating_add(RECORD_HEAD_BYTES).saturating_add(usize::try_from(length).unwrap_or(usize::MAX));
+        Some((at, bytes))
+    });
+    heads.filter_map(|(at, bytes)| message_of(bytes).map(|(channel, log_time)| (at, channel, log_time)))
 }
 
 /// The channel and the log time of the message that starts with these bytes; `None` if it is another record.

@@ -13,7 +13,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use clearway_proto::v1;
 use clearway_ros::Kind;
-use mcap::records::Record;
+use mcap::records::{Metadata, Record};
 use prost::Message as _;
 
 use crate::base::counted::counted;
@@ -118,6 +118,12 @@ pub enum McapReadError {
         /// The file.
         file: PathBuf,
     },
+    /// The file was searched for records of an MCAP file, and has none.
+    #[error("{}: not an MCAP file, and no record of one is in it", file.display())]
+    NoRecord {
+        /// The file.
+        file: PathBuf,
+    },
     /// A later version of clearway wrote the file.
     #[error("{}: a recording with {found}; this clearway reads {known}: use the version that wrote it, {by}, or a later one",
         file.display())]
@@ -154,6 +160,8 @@ pub struct McapReader {
     read: BTreeMap<u16, u64>,
     /// What a repair could not read, in file order.
     repaired: Vec<String>,
+    /// True if the format in the metadata is damaged.
+    has_wrong_format: bool,
     has_ended: bool,
 }
 
@@ -200,6 +208,7 @@ impl McapReader {
             stated: None,
             read: BTreeMap::new(),
             repaired: Vec::new(),
+            has_wrong_format: false,
             has_ended: false,
         }
     }
@@ -234,6 +243,19 @@ impl McapReader {
         self.records.lost().len()
     }
 
+    /// The contents of a metadata record, with the format of the file if it is damaged there.
+    pub(super) fn with_known_format(&self, mut metadata: Metadata) -> Metadata {
+        if self.has_wrong_format && metadata.name == "clearway" {
+            metadata.metadata.insert("format".into(), FORMAT.to_string());
+        }
+        metadata
+    }
+
+    /// Number of damaged parts so far whose contents no other record repeats.
+    pub fn loss_count(&self) -> usize {
+        self.records.lost().iter().filter(|part| part.is_loss).count()
+    }
+
     /// What `clearway repair` could not read of the damaged file, if it wrote this one: the losses so far, in file
     /// order. The file itself is whole.
     pub fn repaired(&self) -> &[String] {
@@ -262,6 +284,11 @@ impl McapReader {
         let mut faults = Vec::new();
         if self.is_cut() {
             faults.push(format!("cut after {} bytes: the closing records are missing", self.bytes_read()));
+        }
+        if self.has_ended && self.has_wrong_format {
+            let of = |key: &str| self.header.metadata.get(key).map_or("", |value| value);
+            let (format, version) = (of("format"), of("version"));
+            faults.push(format!("its metadata has format {format:?}, which clearway {version} has never written"));
         }
         if self.has_ended && self.unknown > 0 {
             faults.push(format!("{} of channels that the file does not describe", counted(self.unknown, "message")));
@@ -293,6 +320,11 @@ impl McapReader {
     /// Number of messages by the file's own count, if it can be trusted; `None` before the last message.
     pub(super) fn stated_messages(&self) -> Option<u64> {
         self.stated.as_ref().filter(|_| self.has_ended).map(|(messages, _)| *messages)
+    }
+
+    /// Number of messages that the file lacks by its own count, if that can be trusted; 0 before the last message.
+    pub fn missing_messages(&self) -> u64 {
+        self.stated_messages().map_or(0, |stated| stated.saturating_sub(self.read.values().sum()))
     }
 
     fn topic(&self, id: u16) -> String {
@@ -337,6 +369,7 @@ impl McapReader {
                     McapReadError::Read { file: self.file.clone(), source: advised(&self.file, source) }
                 }
                 RecordsError::NotMcap => McapReadError::NotMcap { file: self.file.clone() },
+                RecordsError::NoRecord => McapReadError::NoRecord { file: self.file.clone() },
             })?,
         };
         let Some(mut record) = record else {
@@ -378,7 +411,7 @@ impl McapReader {
                 let boot_id = metadata.metadata.get("boot_id").and_then(|id| id.parse().ok());
                 self.header.boot_id = boot_id.unwrap_or_default();
                 self.header.metadata.clone_from(&metadata.metadata);
-                self.check_format()?;
+                self.has_wrong_format = !self.has_known_format()?;
             }
             Record::Metadata(metadata) if metadata.name == REPAIR_METADATA => {
                 self.repaired.extend(metadata.metadata.get(REPAIR_LOST_KEY).cloned());
@@ -397,11 +430,17 @@ impl McapReader {
         Ok(())
     }
 
-    fn check_format(&self) -> Result<(), McapReadError> {
-        let Some(found) = self.header.metadata.get("format") else { return Ok(()) };
-        match found.parse::<u32>() {
-            Ok(1..=FORMAT) => Ok(()),
-            _ => Err(self.version_error(format!("format {found}"), format!("formats up to {FORMAT}"))),
+    /// False if the format is one that the version that wrote the file cannot have written: then the metadata, which
+    /// no checksum of its own covers, is damaged. An error if a later version wrote the file.
+    fn has_known_format(&self) -> Result<bool, McapReadError> {
+        let Some(found) = self.header.metadata.get("format") else { return Ok(true) };
+        if matches!(found.parse::<u32>(), Ok(1..=FORMAT)) {
+            return Ok(true);
+        }
+        let by = self.header.metadata.get("version").and_then(|by| version_numbers(by));
+        match by.is_some_and(|by| Some(by) <= version_numbers(env!("CARGO_PKG_VERSION"))) {
+            true => Ok(false),
+            false => Err(self.version_error(format!("format {found}"), format!("formats up to {FORMAT}"))),
         }
     }
 
@@ -432,6 +471,11 @@ impl Iterator for McapReader {
         self.has_ended |= matches!(next, Some(Err(_)));
         next
     }
+}
+
+/// The numbers of a version such as `0.1.0`, which compare as versions do.
+fn version_numbers(version: &str) -> Option<Vec<u32>> {
+    version.split('.').map(|number| number.parse().ok()).collect()
 }
 
 fn open(file: &Path, any_start: bool) -> Result<FileRecords, McapReadError> {

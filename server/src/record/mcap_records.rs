@@ -4,22 +4,20 @@
 //! A damaged record costs that record: its length or, if that is damaged too, a search finds the next one. A record
 //! found by the search is accepted only if its fields agree with each other and with what follows.
 
-use std::collections::BTreeMap;
 use std::io::{self, Read};
 
 use mcap::records::{MessageIndex, Record, op};
 use mcap::{MAGIC, McapError};
 
-use super::chunk::{RECORD_BYTES_MAX, RECORD_HEAD_BYTES, attachment_name, decompress, parse, split_record};
+use super::chunk::{
+    CHUNK_FIELDS_BYTES, RECORD_BYTES_MAX, RECORD_HEAD_BYTES, attachment_name, decompress, parse_strictly, split_record,
+};
+use super::chunk_indexes::ChunkIndexes;
 use super::damage::LostPart;
 use super::section_crc::{Finding, SectionCrc};
 
 /// Bytes that a search reads at once.
 const SEARCH_BYTES: usize = 1 << 20;
-/// Length of the fields of a chunk before its data, without the name of its compression.
-const CHUNK_FIELDS_BYTES: usize = 40;
-/// Greatest length of fields that a later version of the format adds to a record. Ours.
-const ADDED_BYTES_MAX: usize = 1024;
 /// Least kind of the records that programs define for themselves.
 const PRIVATE: u8 = 0x80;
 /// Names of the compressions, as chunks have them.
@@ -29,7 +27,10 @@ const COMPRESSIONS: [&[u8]; 3] = [b"", b"zstd", b"lz4"];
 #[derive(Debug)]
 pub(super) enum RecordsError {
     Read(io::Error),
+    /// The file does not start as an MCAP file does.
     NotMcap,
+    /// The file was searched, and has no record.
+    NoRecord,
 }
 
 impl From<io::Error> for RecordsError {
@@ -59,6 +60,10 @@ pub(super) struct McapRecords {
     chunk: (Vec<u8>, usize),
     /// The bytes of the chunk in the file.
     chunk_bytes: (u64, u64),
+    /// The message indexes of the chunk that were read.
+    indexes: ChunkIndexes,
+    /// Number of lost parts before the end of the chunk.
+    lost_before_indexes: usize,
     /// CRC of the consumed bytes of the section.
     crc: SectionCrc,
     /// Number of lost parts before the section.
@@ -87,6 +92,8 @@ impl McapRecords {
             section: Section::Start,
             chunk: (Vec::new(), 0),
             chunk_bytes: (0, 0),
+            indexes: ChunkIndexes::default(),
+            lost_before_indexes: 0,
             crc: SectionCrc::default(),
             lost_before: 0,
             any_start,
@@ -166,7 +173,7 @@ impl McapRecords {
         } else if self.any_start {
             self.search("the file does not start with the magic bytes")?;
             if self.section == Section::Ended {
-                return Err(RecordsError::NotMcap);
+                return Err(RecordsError::NoRecord);
             }
         } else {
             return Err(RecordsError::NotMcap);
@@ -191,14 +198,20 @@ impl McapRecords {
             self.search("a record reaches beyond the end of the file")?;
             return Ok(None);
         }
-        let record = parse_strictly(opcode, &self.bytes()[RECORD_HEAD_BYTES..end]);
+        let body = &self.bytes()[RECORD_HEAD_BYTES..end];
+        let is_index = matches!(opcode, op::MESSAGE | PRIVATE..) && ChunkIndexes::is_index(body, &self.chunk.0);
+        let record = parse_strictly(opcode, body);
         let from = self.offset;
         let read = match record {
+            _ if is_index => Err(("it has the kind of other records".to_owned(), None)),
             Ok(Record::Chunk { header, data }) => match decompress(&header, &data) {
                 Ok(content) => {
-                    self.chunk = (content.into_owned(), 0);
+                    let content = content.into_owned();
+                    self.end_indexes();
+                    self.chunk = (content, 0);
                     self.chunk_bytes = (from, from + end as u64);
                     (self.has_chunks, self.indexes_are_lost) = (true, false);
+                    (self.indexes, self.lost_before_indexes) = (ChunkIndexes::default(), self.lost.len());
                     Ok(None)
                 }
                 Err(error) => Err((error.to_string(), Some((header.message_start_time, header.message_end_time)))),
@@ -208,18 +221,12 @@ impl McapRecords {
         };
         match read {
             Ok(record) => {
+                let private = self.private.take();
                 match &record {
                     Some(Record::DataEnd(data_end)) => self.end_data(data_end.data_section_crc, end),
                     Some(Record::Footer(footer)) => self.end_summary(footer.summary_crc, end)?,
-                    Some(Record::MessageIndex(index)) if !self.indexes_are_lost => self.consume_index(index, end),
+                    Some(Record::MessageIndex(index)) => self.read_index(index, end, private),
                     _ => self.consume(end),
-                }
-                let private = self.private.take();
-                if let Some(Record::MessageIndex(index)) = &record {
-                    private
-                        .into_iter()
-                        .for_each(|chunk| self.add_lost(chunk, &"a chunk has the kind of other records"));
-                    self.add_index(index);
                 }
                 self.private = Some((from, self.offset)).filter(|_| opcode >= PRIVATE);
                 Ok(record)
@@ -241,6 +248,7 @@ impl McapRecords {
 
     /// Consumes the record that ends the data section, and checks the section's CRC unless a part of it is lost.
     fn end_data(&mut self, saved: u32, end: usize) {
+        self.end_indexes();
         let (from, crc) = (self.offset, std::mem::take(&mut self.crc));
         self.has_data_end = true;
         self.consume(end);
@@ -295,10 +303,29 @@ impl McapRecords {
         Ok(())
     }
 
-    /// Adds the messages of an index to the newest lost part, if they were in it.
-    fn add_index(&mut self, index: &MessageIndex) {
-        if let Some(lost) = self.lost.last_mut().filter(|_| self.indexes_are_lost) {
-            lost.add_index(index);
+    /// Consumes an index: of the newest chunk, or of a chunk that is lost. A record of a private kind before it was one.
+    fn read_index(&mut self, index: &MessageIndex, end: usize, private: Option<(u64, u64)>) {
+        let body = &self.buffer[self.start + RECORD_HEAD_BYTES..self.start + end];
+        let Some(right) = self.indexes.add(index, body, &self.chunk.0) else { return self.consume(end) };
+        if let Some(chunk) = private {
+            self.add_lost(chunk, &"a chunk has the kind of other records");
+        }
+        if self.indexes_are_lost {
+            self.consume(end);
+            self.lost.last_mut().into_iter().for_each(|lost| lost.add_index(index));
+        } else {
+            self.crc.update_wrong_index(self.offset, &self.buffer[self.start..self.start + end], &right);
+            self.start += end;
+            self.offset += end as u64;
+        }
+    }
+
+    /// Decides whether the only lost part behind the newest chunk was the indexes of the chunk, of which nothing else
+    /// was lost.
+    fn end_indexes(&mut self) {
+        let Some([part]) = self.lost.get_mut(self.lost_before_indexes..) else { return };
+        if part.is_loss && part.bytes.1 - part.bytes.0 == self.indexes.missing_bytes(&self.chunk.0) {
+            *part = LostPart::new(part.bytes, format!("a message index: {}", part.reason), false);
         }
     }
 
@@ -419,14 +446,6 @@ impl McapRecords {
         self.start += count;
         self.offset += count as u64;
     }
-
-    /// Consumes an index of the newest chunk.
-    fn consume_index(&mut self, index: &MessageIndex, count: usize) {
-        let record = &self.buffer[self.start..self.start + count];
-        self.crc.update_index(self.offset, record, index, &self.chunk.0);
-        self.start += count;
-        self.offset += count as u64;
-    }
 }
 
 /// The kind and the length of a record, from its head; no length if it is greater than any record's.
@@ -438,36 +457,6 @@ fn head(bytes: &[u8]) -> (u8, Option<usize>) {
 /// True for the kinds of the specification and for private ones.
 fn is_opcode(opcode: u8) -> bool {
     (op::HEADER..=op::DATA_END).contains(&opcode) || opcode >= PRIVATE
-}
-
-/// Parses a record, and refuses one whose length is not that of its fields, because its kind or its length is damaged.
-fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
-    let record = parse(opcode, body)?;
-    let texts = |texts: &BTreeMap<String, String>| {
-        size_of::<u32>()
-            + texts.iter().map(|(key, value)| 2 * size_of::<u32>() + key.len() + value.len()).sum::<usize>()
-    };
-    // A later version of the format may add fields at the end of these, which are short.
-    let fields = match &record {
-        Record::Header(of) => Some(8 + of.profile.len() + of.library.len()),
-        Record::Schema { header, data } => Some(14 + header.name.len() + header.encoding.len() + data.len()),
-        Record::Channel(of) => Some(12 + of.topic.len() + of.message_encoding.len() + texts(&of.metadata)),
-        Record::Metadata(of) => Some(4 + of.name.len() + texts(&of.metadata)),
-        Record::Attachment { header, data, .. } => Some(36 + header.name.len() + header.media_type.len() + data.len()),
-        _ => None,
-    };
-    if fields.is_some_and(|fields| body.len() > fields + ADDED_BYTES_MAX) {
-        return Err(McapError::UnexpectedEof);
-    }
-    let length = match &record {
-        Record::Footer(_) => 20,
-        Record::DataEnd(_) => 4,
-        Record::SummaryOffset(_) => 17,
-        Record::MessageIndex(index) => 6 + 16 * index.records.len(),
-        Record::Chunk { header, data } => CHUNK_FIELDS_BYTES + header.compression.len() + data.len(),
-        _ => body.len(),
-    };
-    if length == body.len() { Ok(record) } else { Err(McapError::UnexpectedEof) }
 }
 
 /// Why a record of this kind cannot be read, with its name if it has one.

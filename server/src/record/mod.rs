@@ -5,6 +5,7 @@
 //! | [`writer`] | events and maps -> queue -> recorder thread |
 //! | [`mcap_file`] | events and maps -> bytes of the MCAP file |
 //! | `mcap_records`, `chunk` | the bytes of any MCAP file -> its records, and the parts that cannot be read |
+//! | `chunk_indexes` | the indexes behind a chunk -> whether a lost part was only some of them |
 //! | `section_crc` | the bytes of a section -> whether any has changed |
 //! | `bag_records` | a ROS 2 bag in sqlite -> the same records |
 //! | `file_records` | a file of either kind -> its records |
@@ -21,6 +22,7 @@
 mod bag_records;
 pub mod channel;
 mod chunk;
+mod chunk_indexes;
 pub mod compare;
 pub mod damage;
 mod file_records;

@@ -84,11 +84,13 @@ pub enum RecordingError {
         /// The fault of the message.
         source: EventDecodeError,
     },
-    /// The file has no configuration: another program wrote it, or it was cut before its first message.
-    #[error("{}: no attachment config.toml: not a recording of clearway, or cut at its very start", file.display())]
+    /// The file has no configuration: another program wrote it, it was cut before its first message, or it is damaged.
+    #[error("{}: no attachment config.toml: {reason}", file.display())]
     NoConfig {
         /// The recording.
         file: PathBuf,
+        /// Why it has none, as far as known.
+        reason: String,
     },
     /// The recorded configuration is invalid.
     #[error(transparent)]
@@ -188,9 +190,14 @@ impl RecordingReader {
         self.reader.repaired()
     }
 
-    /// Number of damaged parts so far, of this file and of the one from which it was repaired.
+    /// Number of lost parts so far, of this file and of the one from which it was repaired.
     pub fn loss_count(&self) -> usize {
-        self.reader.damage_count() + self.repaired().len()
+        self.reader.loss_count() + self.repaired().len()
+    }
+
+    /// Number of messages that the file lacks by its own count, if that can be trusted; 0 before the last message.
+    pub fn missing_messages(&self) -> u64 {
+        self.reader.missing_messages()
     }
 
     /// How the file is incomplete: damaged, cut, or with fewer messages than it says. `None` for a complete file, and
@@ -218,7 +225,8 @@ impl RecordingReader {
     /// [`RecordingError::Calibration`] if a table that it names is missing or invalid.
     pub fn config(&self) -> Result<(Config, Calibrations), RecordingError> {
         let (file, header) = (self.reader.file(), self.header());
-        let text = header.config.as_ref().ok_or_else(|| RecordingError::NoConfig { file: file.to_owned() })?;
+        let no_config = || RecordingError::NoConfig { file: file.to_owned(), reason: self.why_no_config() };
+        let text = header.config.as_ref().ok_or_else(no_config)?;
         let mut config = Config::parse(text, &file.join("config.toml"), &[])?;
         use_rules_of_the_run(&mut config, text);
         let table = |vehicle: &str, sensor: &clearway_mapping::config::SensorConfig| {
@@ -237,6 +245,16 @@ impl RecordingReader {
             .map(|v| v.sensors.iter().map(|s| table(&v.name, s)).collect())
             .collect::<Result<_, _>>()?;
         Ok((config, tables))
+    }
+
+    fn why_no_config(&self) -> String {
+        let damages = self.damages();
+        let mut lost = damages.iter().map(ToString::to_string).chain(self.repaired().iter().cloned());
+        match lost.find(|lost| lost.contains("config.toml")) {
+            Some(lost) => format!("it is lost ({lost}), and without it its maps cannot be made again"),
+            None if self.header().metadata.is_empty() => "not a recording of clearway, or cut at its very start".into(),
+            None => "it is lost, and without it its maps cannot be made again".into(),
+        }
     }
 
     fn decode(&self, message: Message) -> Option<Result<RecordedMessage, RecordingError>> {

@@ -27,6 +27,8 @@ pub struct Report {
     pub incomplete: Option<String>,
     /// True if the new file lacks a record, or may have a changed one.
     pub is_loss: bool,
+    /// True if the file is a recording of clearway whose configuration is lost: the new one cannot be verified.
+    pub lacks_config: bool,
 }
 
 impl Report {
@@ -34,7 +36,7 @@ impl Report {
     pub fn to_json(&self) -> Value {
         json!({
             "messages": self.messages, "lost_messages": self.lost_messages, "incomplete": self.incomplete,
-            "is_loss": self.is_loss,
+            "is_loss": self.is_loss, "lacks_config": self.lacks_config,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
         })
     }
@@ -122,10 +124,12 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
     // Ids of the damaged file -> ids of the new one.
     let (mut schemas, mut channels) = (BTreeMap::from([(0, 0)]), BTreeMap::new());
     while let Some(record) = reader.next_record()? {
-        if reader.damage_count() > damages {
-            let lost: Vec<String> = reader.damages()[damages..].iter().map(ToString::to_string).collect();
-            damages += lost.len();
-            writer.write_metadata(&lost_here(lost)).map_err(failed)?;
+        // Only the message behind a damaged part decides what was lost with it.
+        if matches!(record, Record::Message { .. }) && reader.damage_count() > damages {
+            for lost in losses(&reader.damages()[damages..]) {
+                writer.write_metadata(&lost_here(lost)).map_err(failed)?;
+            }
+            damages = reader.damage_count();
         }
         let copied = match record {
             Record::Schema { header, data } => {
@@ -145,7 +149,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
                 }
                 None => Ok(()),
             },
-            Record::Metadata(metadata) => writer.write_metadata(&metadata),
+            Record::Metadata(metadata) => writer.write_metadata(&reader.with_known_format(metadata)),
             Record::Attachment { header, data, .. } => {
                 let AttachmentHeader { log_time, create_time, name, media_type } = header;
                 writer.attach(&Attachment { log_time, create_time, name, media_type, data })
@@ -154,18 +158,20 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
         };
         copied.map_err(failed)?;
     }
-    report.lost_messages = reader.stated_messages().map(|stated| stated.saturating_sub(report.messages));
+    report.lost_messages = reader.stated_messages().map(|_| reader.missing_messages());
     (report.damages, report.incomplete) = (reader.damages(), reader.incomplete());
     if report.messages == 0 {
         return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });
     }
     report.is_loss = report.damages.iter().any(|damage| damage.is_loss) || reader.is_loss_at_end();
-    let mut at_end: Vec<String> = report.damages[damages..].iter().map(ToString::to_string).collect();
+    let header = reader.header();
+    report.lacks_config = header.config.is_none() && !header.metadata.is_empty();
+    let mut at_end = losses(&report.damages[damages..]);
     if reader.is_loss_at_end() {
         at_end.extend(reader.faults_of_end());
     }
-    if !at_end.is_empty() {
-        writer.write_metadata(&lost_here(at_end)).map_err(failed)?;
+    for lost in at_end {
+        writer.write_metadata(&lost_here(lost)).map_err(failed)?;
     }
     writer.finish().map_err(failed)?;
     let file = writer.into_inner().into_inner().map_err(|error| failed(McapError::Io(error.into_error())))?;
@@ -173,9 +179,14 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
     Ok(report)
 }
 
+/// The texts of those damages that are losses.
+fn losses(damages: &[Damage]) -> Vec<String> {
+    damages.iter().filter(|damage| damage.is_loss).map(ToString::to_string).collect()
+}
+
 /// The metadata at the place of a loss.
-fn lost_here(lost: Vec<String>) -> Metadata {
-    let metadata = BTreeMap::from([(REPAIR_LOST_KEY.to_owned(), lost.join("; "))]);
+fn lost_here(lost: String) -> Metadata {
+    let metadata = BTreeMap::from([(REPAIR_LOST_KEY.to_owned(), lost)]);
     Metadata { name: REPAIR_METADATA.into(), metadata }
 }
 

@@ -2,9 +2,8 @@
 //! message indexes have changed, which repeat what chunks hold.
 
 use crc32fast::Hasher;
-use mcap::records::MessageIndex;
 
-use super::chunk::{RECORD_HEAD_BYTES, index_of, is_message};
+use super::chunk::RECORD_HEAD_BYTES;
 
 /// The CRC of the section that is read.
 #[derive(Default)]
@@ -36,17 +35,15 @@ impl SectionCrc {
         }
     }
 
-    /// Adds a message index: its record, which starts at `offset` of the file, and the content of its chunk. Where the
-    /// two differ, only the CRC can tell whether the index is damaged or its writer orders it in another way.
-    pub(super) fn update_index(&mut self, offset: u64, record: &[u8], index: &MessageIndex, chunk: &[u8]) {
-        if index.records.iter().all(|entry| is_message(chunk, index.channel_id, entry)) {
-            return self.update(record);
-        }
+    /// Adds a message index that does not agree with its chunk: its record, which starts at `offset` of the file, and
+    /// the body that it should have. Only the CRC can tell whether the index is damaged or its writer orders it in
+    /// another way.
+    pub(super) fn update_wrong_index(&mut self, offset: u64, record: &[u8], body: &[u8]) {
         let crc = self.with_indexes.take().unwrap_or_else(|| self.crc.clone());
         self.crc.update(record);
         let with_indexes = self.with_indexes.insert(crc);
         with_indexes.update(&record[..RECORD_HEAD_BYTES]);
-        with_indexes.update(&index_of(chunk, index.channel_id));
+        with_indexes.update(body);
         self.wrong_indexes.push((offset, offset + record.len() as u64));
     }
 

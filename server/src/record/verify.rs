@@ -6,7 +6,6 @@
 //! the file lacks are counted as unjudged: those after a gap, until the next keyframe.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -15,9 +14,6 @@ use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::{ConfigValueError, VehicleConfig};
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::{Handover, Pipeline};
-use clearway_proto::codec::{DecodeError, Limits};
-use clearway_proto::grid::Grid;
-use clearway_proto::map::{Channel, Layer, MapError, decode_map};
 use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
@@ -27,6 +23,11 @@ use crate::encode::{EncodedMap, as_served, as_served_with};
 use crate::record::damage::Damage;
 use crate::record::mcap_file::sha256;
 use crate::record::reader::{Beginning, RecordedMessage, RecordingError, RecordingReader};
+
+mod difference;
+
+use difference::first_difference;
+pub use difference::{Difference, DifferenceKind};
 
 /// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
 const DIFFERENCES_MAX: usize = 20;
@@ -68,55 +69,8 @@ pub struct Report {
     pub differences: Vec<Difference>,
     /// Number of all differences.
     pub different: u64,
-}
-
-/// A difference between a recording and the maps of its events.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Difference {
-    /// The vehicle's name.
-    pub vehicle: String,
-    /// Sequence of the map, or of the first missing event.
-    pub sequence: u64,
-    /// The layer's name; empty for missing events.
-    pub layer: String,
-    /// The first difference of the map.
-    pub kind: DifferenceKind,
-}
-
-/// The kind of a difference.
-#[derive(Clone, Debug, PartialEq)]
-pub enum DifferenceKind {
-    /// A cell differs.
-    Cell {
-        /// Row of the grid.
-        row: u32,
-        /// Column of the grid.
-        column: u32,
-        /// The channel's name.
-        channel: String,
-        /// Raw value in the recording.
-        recorded: i32,
-        /// Raw value computed from the events.
-        computed: i32,
-    },
-    /// Another part of the map differs.
-    Field {
-        /// Name of the part.
-        field: String,
-        /// Value in the recording.
-        recorded: String,
-        /// Value computed from the events.
-        computed: String,
-    },
-    /// The recording lacks this map of the events.
-    Missing,
-    /// The recording has this map, which does not follow from the events.
-    Extra,
-    /// The journal lacks the events from the difference's sequence up to `found`.
-    Gap {
-        /// Sequence of the next event in the journal.
-        found: u64,
-    },
+    /// Number of those that are gaps of a journal.
+    pub gaps: u64,
 }
 
 /// A recording cannot be verified.
@@ -153,47 +107,9 @@ impl Report {
 
     fn add(&mut self, vehicle: &str, sequence: u64, layer: &str, kind: DifferenceKind) {
         self.different += 1;
+        self.gaps += u64::from(matches!(kind, DifferenceKind::Gap { .. }));
         if self.differences.len() < DIFFERENCES_MAX {
             self.differences.push(Difference { vehicle: vehicle.into(), sequence, layer: layer.into(), kind });
-        }
-    }
-}
-
-impl Difference {
-    fn to_json(&self) -> Value {
-        let kind = match &self.kind {
-            DifferenceKind::Cell { row, column, channel, recorded, computed } => json!({
-                "cell": { "row": row, "column": column, "channel": channel, "recorded": recorded, "computed": computed }
-            }),
-            DifferenceKind::Field { field, recorded, computed } => {
-                json!({ "field": { "name": field, "recorded": recorded, "computed": computed } })
-            }
-            DifferenceKind::Missing => json!("missing"),
-            DifferenceKind::Extra => json!("extra"),
-            DifferenceKind::Gap { found } => json!({ "gap": { "found": found } }),
-        };
-        json!({ "vehicle": self.vehicle, "sequence": self.sequence, "layer": self.layer, "what": kind })
-    }
-}
-
-impl fmt::Display for Difference {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { vehicle, sequence, layer, kind } = self;
-        if let DifferenceKind::Gap { found } = kind {
-            return write!(f, "vehicle {vehicle}: the journal lacks events {sequence} to {}", found.saturating_sub(1));
-        }
-        write!(f, "vehicle {vehicle}, sequence {sequence}, layer {layer}: ")?;
-        match kind {
-            DifferenceKind::Cell { row, column, channel, recorded, computed } => {
-                write!(f, "cell row {row} column {column}, channel {channel}: recorded {recorded}, computed {computed}")
-            }
-            DifferenceKind::Field { field, recorded, computed } => {
-                write!(f, "{field}: recorded {recorded}, computed {computed}")
-            }
-            DifferenceKind::Missing => write!(f, "the recording lacks this map of the events"),
-            DifferenceKind::Extra | DifferenceKind::Gap { .. } => {
-                write!(f, "the recording has this map, which does not follow from the events")
-            }
         }
     }
 }
@@ -301,13 +217,19 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
         let differs = format!("its metadata has the boot id {stated_boot_id}, and its maps have {boot_id}");
         report.incomplete.get_or_insert(differs);
     }
+    // Only its end says so: then the messages were written, and cut out of the file later.
+    let lacks_messages = recording.missing_messages() > 0;
+    if lacks_messages {
+        report.different -= std::mem::take(&mut report.gaps);
+        report.differences.retain(|difference| !matches!(difference.kind, DifferenceKind::Gap { .. }));
+    }
     for replay in &replays {
         // The recorder writes an event before its map, so a cut can remove only the map of the last event.
         let tail = replay.computed.last_key_value().map(|((sequence, _), _)| *sequence);
         for (sequence, layer) in replay.computed.keys() {
             if report.cut && Some(*sequence) == tail {
                 report.beyond_cut += 1;
-            } else if replay.lacks_events || recording.loss_count() > 0 {
+            } else if replay.lacks_events || lacks_messages || recording.loss_count() > 0 {
                 report.unjudged += 1;
             } else {
                 report.add(&replay.name, *sequence, layer, DifferenceKind::Missing);
@@ -411,88 +333,4 @@ fn sequence_and_cells(bytes: &Bytes) -> (u64, u64) {
     let channels = map.layers.first().map(|layer| &layer.channels[..]).unwrap_or_default();
     let cells = channels.first().map_or(0, |channel| channel.cell_count.into());
     (map.header.map_or(u64::MAX, |header| header.sequence), cells)
-}
-
-/// The first difference of two encoded maps of one layer, in the order header, geometry, channels, all else.
-fn first_difference(recorded: &Bytes, computed: &Bytes) -> DifferenceKind {
-    let field = |field: &str, recorded: &dyn fmt::Debug, computed: &dyn fmt::Debug| DifferenceKind::Field {
-        field: field.to_owned(),
-        recorded: format!("{recorded:?}"),
-        computed: format!("{computed:?}"),
-    };
-    let (was, is) = match (v1::Map::decode(recorded.clone()), v1::Map::decode(computed.clone())) {
-        (Ok(was), Ok(is)) => (was, is),
-        (was, is) => return field("message", &was.err(), &is.err()),
-    };
-    let (head, new) = (was.header.unwrap_or_default(), is.header.unwrap_or_default());
-    let fields: [(&str, &dyn fmt::Debug, &dyn fmt::Debug); 12] = [
-        ("header vehicle", &head.vehicle, &new.vehicle),
-        ("header boot_id", &head.boot_id, &new.boot_id),
-        ("header sequence", &head.sequence, &new.sequence),
-        ("header capture_start_ns", &head.capture_start_ns, &new.capture_start_ns),
-        ("header capture_end_ns", &head.capture_end_ns, &new.capture_end_ns),
-        ("header completed_ns", &head.completed_ns, &new.completed_ns),
-        ("header valid_until_ns", &head.valid_until_ns, &new.valid_until_ns),
-        ("header map_from_ego", &head.map_from_ego, &new.map_from_ego),
-        ("header speed_mps", &head.speed_mps, &new.speed_mps),
-        ("header sensors", &head.sensors, &new.sensors),
-        ("header compensation", &head.compensation, &new.compensation),
-        ("header source_sensor", &head.source_sensor, &new.source_sensor),
-    ];
-    for (name, a, b) in fields {
-        // Debug distinguishes all values: it prints floats exactly, and -0 differs from 0.
-        if format!("{a:?}") != format!("{b:?}") {
-            return field(name, a, b);
-        }
-    }
-    let (Some(was), Some(is)) = (was.layers.first(), is.layers.first()) else {
-        return field("layers", &was.layers.len(), &is.layers.len());
-    };
-    if was.geometry != is.geometry {
-        return field("geometry", &was.geometry, &is.geometry);
-    }
-    let columns = Grid::from_wire(is).map_or(1, |grid| grid.shape().1.max(1));
-    let (recorded, computed) = match (decode_first_layer(recorded), decode_first_layer(computed)) {
-        (Ok(recorded), Ok(computed)) => (recorded, computed),
-        (was, is) => return field("cells", &was.err(), &is.err()),
-    };
-    for (a, b) in was.channels.iter().zip(&is.channels) {
-        if a == b {
-            continue;
-        }
-        if let (Some(recorded), Some(computed)) = (recorded.channel(&a.name), computed.channel(&b.name)) {
-            let cells = 0..recorded.cells.len().min(computed.cells.len());
-            let value = |of: &Channel, cell: usize| of.cells.get(cell).unwrap_or_default();
-            if let Some(cell) = cells.into_iter().find(|&cell| value(recorded, cell) != value(computed, cell)) {
-                let (row, column) = (cell as u32 / columns, cell as u32 % columns);
-                let (recorded, computed) = (value(recorded, cell), value(computed, cell));
-                return DifferenceKind::Cell { row, column, channel: b.name.clone(), recorded, computed };
-            }
-        }
-        return field(&format!("channel {}", b.name), a, b);
-    }
-    field("layer", &was, &is)
-}
-
-/// Decodes the first layer of a map, also if a checksum of its cells is wrong, and without the channels that cannot be
-/// decoded.
-fn decode_first_layer(bytes: &Bytes) -> Result<Layer, MapError> {
-    let mut bytes = bytes.clone();
-    loop {
-        let (of, name, source) = match decode_map(bytes.clone(), &Limits::default()) {
-            Err(MapError::Cells { layer, channel, source }) => (layer, channel, source),
-            map => return map.map(|mut map| map.layers.swap_remove(0)),
-        };
-        let mut map = v1::Map::decode(bytes)?;
-        for layer in map.layers.iter_mut().filter(|layer| layer.name == of) {
-            match source {
-                DecodeError::Crc { computed, .. } => {
-                    let channels = layer.channels.iter_mut().filter(|channel| channel.name == name);
-                    channels.for_each(|channel| channel.crc32 = computed);
-                }
-                _ => layer.channels.retain(|channel| channel.name != name),
-            }
-        }
-        bytes = map.encode_to_vec().into();
-    }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
-use std::io::{BufReader, Read};
+use std::io::BufReader;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
@@ -22,6 +22,7 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line};
 use crate::encode::event_from_bytes;
+use crate::ingest::files::{Kind, kind};
 use crate::record::mcap_reader::{McapReader, Message};
 
 /// Describe a file: a recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd).
@@ -43,15 +44,13 @@ pub struct Options {
 /// If the file cannot be read or its kind is not known.
 pub fn run(options: &Options) -> Result<Exit> {
     let file = &options.file;
-    let mut start = Vec::new();
-    files::open(file)?.0.take(8).read_to_end(&mut start).with_context(|| file.display().to_string())?;
-    let extension = file.extension().and_then(|extension| extension.to_str()).unwrap_or("");
-    let document = match extension {
-        "bin" | "pcd" => scan_file(file),
-        _ if extension == "mcap" || start.starts_with(b"\x89MCAP") || start == b"SQLite f" => recording(file),
-        _ => capture(file),
-    }
-    .with_context(|| file.display().to_string())?;
+    files::open(file)?;
+    let document = match kind(file)? {
+        // Its errors name the file.
+        Kind::Mcap => recording(file)?,
+        Kind::Scan => scan_file(file).with_context(|| file.display().to_string())?,
+        Kind::Capture => capture(file).with_context(|| file.display().to_string())?,
+    };
     if options.json {
         print_line(&serde_json::to_string_pretty(&document)?)?;
     } else {
@@ -181,8 +180,7 @@ struct Source {
 }
 
 fn capture(file: &Path) -> Result<Value> {
-    let mut capture = Capture::new(BufReader::new(open_to_read(file)?))
-        .context("MCAP, .db3, pcap, pcapng, .bin and .pcd are known")?;
+    let mut capture = Capture::new(BufReader::new(open_to_read(file)?))?;
     let mut sources: BTreeMap<SocketAddr, Source> = BTreeMap::new();
     let (mut packets, mut telemetry, mut other) = (0_u64, 0_u64, 0_u64);
     let mut ports: BTreeMap<String, u64> = BTreeMap::new();

@@ -49,6 +49,10 @@ pub fn run(options: &Options) -> Result<Exit> {
         if let Some(incomplete) = &report.incomplete {
             print_line(&format!("{} is {incomplete}", options.input.display()))?;
         }
+        if report.lacks_config {
+            let new = options.output.display();
+            print_line(&format!("{new} has no configuration, so verify cannot make its maps again"))?;
+        }
     }
     Ok(if report.is_loss { Exit::Differs } else { Exit::Good })
 }

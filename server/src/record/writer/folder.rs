@@ -59,7 +59,7 @@ pub trait Files: Send {
     /// [`io::Error`] if it exists or the disk fails.
     fn create(&mut self, part: u64) -> io::Result<Self::File>;
 
-    /// Deletes the file of a part in which nothing was recorded.
+    /// Deletes the file of a part that holds nothing that no other part holds.
     ///
     /// # Errors
     /// [`io::Error`] if the disk fails, or keeps every file.
@@ -228,6 +228,10 @@ impl Files for Folder {
         }
         let file = match File::create_new(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists && self.replaces => {
+                if is_being_written(&path) {
+                    let written = format!("another process is writing {}; name another file", path.display());
+                    return Err(io::Error::new(ErrorKind::ResourceBusy, written));
+                }
                 fs::remove_file(&path)?;
                 File::create_new(&path)
             }
@@ -368,12 +372,15 @@ fn with_infix(file: &Path, infix: &str) -> PathBuf {
 
 /// True if a recording to `file` would meet a file of an earlier one: its first part or, if that was deleted, another.
 fn is_taken(file: &Path) -> bool {
-    let parts = with_infix(file, "part-").file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let name = |entry: io::Result<fs::DirEntry>| Some(entry.ok()?.file_name().to_string_lossy().into_owned());
-    let mut names = fs::read_dir(parent_of(file)).into_iter().flatten().filter_map(name);
-    file.symlink_metadata().is_ok()
-        || with_infix(file, "unfinished").exists()
-        || names.any(|name| name.starts_with(&parts) && is_part_of(file, Path::new(&name)))
+    file.symlink_metadata().is_ok() || with_infix(file, "unfinished").exists() || later_part_of(file).is_some()
+}
+
+/// A part of the recording `file` other than the first.
+pub fn later_part_of(file: &Path) -> Option<PathBuf> {
+    let start = with_infix(file, "part-").file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let mut files = fs::read_dir(parent_of(file)).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path()));
+    let starts = |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(&start));
+    files.find(|path| starts(path) && is_part_of(file, path))
 }
 
 /// True if `path` is named as a part of `file`, or of an earlier run that [`next_free_name`] has named.

@@ -35,8 +35,8 @@ mod recording;
 pub use control::{Command, ControlError, RecorderControl};
 pub use counts::{IncompleteRecordingError, RecorderCounts, RecorderState};
 pub use folder::{
-    Files, Folder, RecordError, confirmation_of, is_being_written, is_same_file, next_free_name, parts_of,
-    recording_path,
+    Files, Folder, RecordError, confirmation_of, is_being_written, is_same_file, later_part_of, next_free_name,
+    parts_of, recording_path,
 };
 pub use handle::RecordingHandle;
 pub use recording::RecordingWriter;

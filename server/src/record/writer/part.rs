@@ -18,6 +18,8 @@ pub(super) struct Part<D: Disk> {
     pub(super) topics: Vec<(u64, u64)>,
     /// Messages written since the newest sync, by topic: what a failure of the disk costs.
     pub(super) unsynced: Vec<u64>,
+    /// True if it holds what no other part holds; a part for which vehicles only warm up does not.
+    pub(super) is_needed: bool,
     /// True if the newest counts in the file are no longer true about what was dropped.
     pub(super) has_loss: bool,
 }

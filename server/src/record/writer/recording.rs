@@ -269,7 +269,7 @@ impl<F: Files> RecordingWriter<F> {
                 let part = self.parts.iter_mut().find(|open| Some(open.number) == part);
                 if let Some(part) = part {
                     topics.iter().for_each(|(topic, count)| part.topics[*topic].1 += count);
-                    part.has_loss = true;
+                    (part.has_loss, part.is_needed) = (true, true);
                     self.reason = "the recorder's queue was full".to_owned();
                     self.write_losses(now);
                 }
@@ -290,7 +290,9 @@ impl<F: Files> RecordingWriter<F> {
             is_written |= self.in_part(number, now, |open| {
                 open.write_event(vehicle, event, journal)?;
                 // An event for a warm-up alone is an additional copy, unless the vehicle has no part.
-                open.unsynced[journal] += u64::from(part.is_none_or(|part| part == number));
+                let is_first_copy = part.is_none_or(|part| part == number);
+                open.unsynced[journal] += u64::from(is_first_copy);
+                open.is_needed |= is_first_copy;
                 Ok(())
             });
         }
@@ -398,7 +400,8 @@ impl<F: Files> RecordingWriter<F> {
         let file = written.map_err(|source| RecordError::Write { file: path.clone(), source })?;
         let count = self.counts.topics().len();
         let (topics, unsynced) = (vec![(0, 0); count], vec![0; count]);
-        self.parts.push_back(Part { number, file, began: now, topics, unsynced, has_loss: false });
+        let is_needed = number == 1;
+        self.parts.push_back(Part { number, file, began: now, topics, unsynced, is_needed, has_loss: false });
         self.counts.set_file(path.display().to_string(), number);
         self.wanted.store(number, Ordering::Release);
         Ok(())
@@ -456,13 +459,16 @@ impl<F: Files> RecordingWriter<F> {
         }
     }
 
-    /// Writes the final counts and closing records of a part, and gives it its name.
+    /// Writes the final counts and closing records of a part, and gives it its name; deletes one that is not needed.
     fn close(&mut self, part: Part<F::File>, now: Instant) {
         let number = part.number;
         let losses = if part.topics.iter().any(|(_, dropped)| *dropped > 0) { &*self.reason } else { "" };
         let counts = part.counts(&self.counts, losses, true);
-        let Part { mut file, unsynced, .. } = part;
+        let Part { mut file, unsynced, is_needed, .. } = part;
         let closed = file.write_counts(&counts).and_then(|()| file.finish());
+        if closed.is_ok() && !is_needed && self.files.discard(number).is_ok() {
+            return;
+        }
         let closed = closed.and_then(|()| self.files.complete(number).map_err(McapError::Io));
         match closed {
             Ok(()) => {

@@ -18,12 +18,14 @@ use crate::record::compare::{Comparison, LayerChange, MapChange};
 pub fn reason(outcome: &Outcome) -> String {
     match outcome {
         Outcome::Verified(report) => {
+            let is_whole = report.incomplete.is_none() && report.repaired.is_empty() && report.dropped == 0;
+            let events = if is_whole { "the events are whole" } else { "the events that are left are in order" };
             let result = match report.differences.first() {
                 Some(first) => format!("{}: {first}", counted(report.different, "difference")),
                 None if report.events == 0 => "no event, so nothing is verified".to_owned(),
-                None if report.recorded == RecordedMaps::None => "the events are whole; no map is recorded".to_owned(),
+                None if report.recorded == RecordedMaps::None => format!("{events}; no map is recorded"),
                 None if report.equal == 0 && report.unjudged > 0 => "no map can be judged".to_owned(),
-                None if report.maps + report.equal == 0 => "the events are whole; no map follows from them".to_owned(),
+                None if report.maps + report.equal == 0 => format!("{events}; no map follows from them"),
                 None => "equal".to_owned(),
             };
             let unjudged = match report.unjudged {

@@ -7,7 +7,7 @@
 //! | `plan` | options, files -> configuration, mount, readings |
 //! | `recordings` | files -> recordings of several vehicles; sensors that do not fit |
 //! | `ready_file` | the running server -> the file that tells programs its addresses |
-//! | `former` | --force, the end of the replay -> the former recording or the new one |
+//! | `record_file` | --record, --force -> whether the file may be written; its name at the end |
 //! | `keys` | lines of a terminal -> requests |
 //! | [`state`] | the state of the replay -> text, JSON |
 //! | [`clouds`] | revolutions -> PCD files |
@@ -43,19 +43,19 @@ use crate::server::{Running, Server, Setup, random};
 use crate::status::VehicleStatus;
 
 pub mod clouds;
-mod former;
 mod keys;
 pub mod options;
 mod plan;
 mod ready_file;
+mod record_file;
 mod recordings;
 pub mod state;
 pub mod summary;
 
-use former::Former;
 pub use options::{Options, ReplayError, Speed};
 use plan::{Plan, plan};
 use ready_file::ReadyFile;
+use record_file::Former;
 use summary::why_no_map;
 pub use summary::{Mount, Summary, describe};
 
@@ -142,7 +142,7 @@ async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Resul
     } else {
         print(&summary.to_text())?
     };
-    let has_no_map = serve && summary.reached_end && summary.maps() == 0;
+    let has_no_map = summary.reached_end && summary.maps() == 0 && (serve || summary.received() == 0);
     if has_no_map {
         eprintln!("clearway: the {what} made no map: {}", why_no_map(&summary.mount, &summary.snapshot));
     }

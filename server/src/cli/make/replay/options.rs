@@ -29,7 +29,7 @@ use crate::server::{ShutdownError, StartError};
   clearway replay drive.mcap --serve --as-live
   clearway replay drive.mcap --serve --as-live --any-port --ready-file ready.json --wait-readers 1 --exit-at-end
 
-Exit codes: 0 the end was reached, 2 failure, a file that is not whole, or a signal before the end, 3 wrong use.")]
+Exit codes: 0 the end was reached, 2 failure, no reading, a file that is not whole, or a signal before the end, 3 wrong use.")]
 pub struct Options {
     /// pcap, pcapng, MCAP, KITTI .bin, nuScenes .pcd.bin and .pcd files, or folders of them, in the order
     /// given.
@@ -247,6 +247,20 @@ pub enum ReplayError {
     RecordExists {
         /// The file.
         file: PathBuf,
+    },
+    /// The recording would replace a symbolic link by a file.
+    #[error("--record {}: this is a symbolic link; name the file that it leads to", file.display())]
+    RecordLink {
+        /// The link.
+        file: PathBuf,
+    },
+    /// The recording would become the first part of an earlier one.
+    #[error("--record {}: {} is a part of an earlier recording of this name; name another file", file.display(), part.display())]
+    RecordParts {
+        /// The file.
+        file: PathBuf,
+        /// The other part.
+        part: PathBuf,
     },
     /// The recording that --force replaces cannot be kept until the new one is whole.
     #[error("--record {}: the file that --force replaces cannot be kept meanwhile: {source}", file.display())]

@@ -16,6 +16,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
+use super::record_file::check_record;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
 use crate::cli::shared::ground_revolutions::{GroundRevolutions, points_of};
@@ -25,7 +26,6 @@ use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
 use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
-use crate::record::writer::is_same_file;
 use crate::replay::faults::Faults;
 use crate::replay::timeline::{Timeline, Track};
 use crate::server::Setup;
@@ -174,29 +174,7 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
         let reason = "a recording begins with the first event; --to may end it earlier";
         return unused(format!("--from {from}"), reason.into());
     }
-    // A name such as `new/../drive.mcap` names a file only when its folders exist. The recorder says if that fails.
-    if let Some(folder) = record.parent() {
-        let _ = std::fs::create_dir_all(folder);
-    }
-    // A folder stands for the files in it.
-    let is_in = |folder: &Path| {
-        let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
-        entries.map(|entry| entry.path()).any(|file| is_same_file(&file, record))
-    };
-    if options.files.iter().any(|file| is_same_file(file, record) || is_in(file)) {
-        return Err(ReplayError::RecordsInput { file: record.clone() });
-    }
-    if record.metadata().is_ok_and(|of| !of.is_file()) {
-        return Err(ReplayError::RecordNoFile { file: record.clone() });
-    }
-    let folder = record.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    if let Some(folder) = options.files.iter().find(|file| is_same_file(file, folder)) {
-        return Err(ReplayError::RecordsIntoInput { file: record.clone(), folder: folder.clone() });
-    }
-    if !options.force && record.symlink_metadata().is_ok() {
-        return Err(ReplayError::RecordExists { file: record.clone() });
-    }
-    Ok(())
+    check_record(options, record)
 }
 
 /// What is known about the vehicle so far.

@@ -105,6 +105,12 @@ impl Summary {
         self.snapshot.maps + self.others.iter().map(|(_, snapshot)| snapshot.maps).sum::<u64>()
     }
 
+    /// Number of readings of all vehicles.
+    pub fn received(&self) -> u64 {
+        let others = self.others.iter().map(|(_, snapshot)| snapshot.ledger.received);
+        self.snapshot.ledger.received + others.sum::<u64>()
+    }
+
     fn mount_json(&self) -> Value {
         let e = &self.extrinsics;
         let mut known = json!({

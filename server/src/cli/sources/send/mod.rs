@@ -21,6 +21,7 @@ use serde_json::{Value, json};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, progress_bar};
+use crate::ingest::files::{Kind as FileKind, kind};
 use crate::record::mcap_reader::McapReader;
 use udp::{Kind, Sender, Speed};
 
@@ -74,9 +75,10 @@ pub fn run(options: &Options) -> Result<Exit> {
         sender: Sender::new(to, telemetry_to, options.bind, options.speed)?,
         skipped: BTreeMap::new(),
     };
-    let is_mcap = options.file.extension().is_some_and(|extension| extension == "mcap" || extension == "db3");
-    let cut =
-        if is_mcap { send_mcap(options, &mut route, length)? } else { send_capture(options, &mut route, length)? };
+    let cut = match kind(&options.file)? {
+        FileKind::Mcap => send_mcap(options, &mut route, length)?,
+        _ => send_capture(options, &mut route, length)?,
+    };
     let sent = route.finish()?;
     report(options, (to, telemetry_to), &sent, cut.as_deref())?;
     if sent.sender.packets + sent.sender.telemetry == 0 {

@@ -1,10 +1,49 @@
-//! `--force` and the end of a replay -> the former recording or the new one under the name of `--record`.
+//! `--record` -> whether the file may be written; `--force` and the end of a replay -> the former recording or the new
+//! one under its name.
 
 use std::io::Error;
 use std::path::{Path, PathBuf};
 
 use super::options::{Options, ReplayError};
-use crate::record::writer::{is_same_file, next_free_name};
+use crate::record::writer::{is_same_file, later_part_of, next_free_name};
+
+/// Refuses a file of `--record` that is replayed, is no file, or may not be replaced.
+///
+/// # Errors
+/// The variants of [`ReplayError`] whose names begin with `Record`.
+pub(super) fn check_record(options: &Options, record: &Path) -> Result<(), ReplayError> {
+    // A name such as `new/../drive.mcap` names a file only when its folders exist. The recorder says if that fails.
+    if let Some(folder) = record.parent() {
+        let _ = std::fs::create_dir_all(folder);
+    }
+    // A folder stands for the files in it.
+    let is_in = |folder: &Path| {
+        let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+        entries.map(|entry| entry.path()).any(|file| is_same_file(&file, record))
+    };
+    if options.files.iter().any(|file| is_same_file(file, record) || is_in(file)) {
+        return Err(ReplayError::RecordsInput { file: record.to_owned() });
+    }
+    let is_folder = record.as_os_str().as_encoded_bytes().ends_with(b"/");
+    if is_folder || record.metadata().is_ok_and(|of| !of.is_file()) {
+        return Err(ReplayError::RecordNoFile { file: record.to_owned() });
+    }
+    let folder = record.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if let Some(folder) = options.files.iter().find(|file| is_same_file(file, folder)) {
+        return Err(ReplayError::RecordsIntoInput { file: record.to_owned(), folder: folder.clone() });
+    }
+    let exists = record.symlink_metadata();
+    if !options.force && exists.is_ok() {
+        return Err(ReplayError::RecordExists { file: record.to_owned() });
+    }
+    if exists.is_ok_and(|of| of.is_symlink()) {
+        return Err(ReplayError::RecordLink { file: record.to_owned() });
+    }
+    if let Some(part) = later_part_of(record) {
+        return Err(ReplayError::RecordParts { file: record.to_owned(), part });
+    }
+    Ok(())
+}
 
 /// The recording that `--force` replaces, under a second name until the new one is whole.
 #[derive(Debug)]
