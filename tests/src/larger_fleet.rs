@@ -101,7 +101,7 @@ impl Fleet {
     /// The least number of routers, and which limit asks for it.
     pub fn routers(&self, is_anywhere: bool, model: &Model) -> Option<(f64, &'static str)> {
         let loads = |routers: usize| self.loads(&self.at(routers as f64, is_anywhere, model));
-        let routers = (1..10_000).find(|routers| loads(*routers).iter().all(|load| *load <= 1.0))?;
+        let routers = (1..2_000).find(|routers| loads(*routers).iter().all(|load| *load <= 1.0))?;
         // With one router less this was over its limit the most.
         let before = loads(routers.max(2) - 1);
         let most = (0..3).max_by(|first, second| before[*first].total_cmp(&before[*second]))?;
@@ -132,6 +132,14 @@ impl Fleet {
         row("from a vehicle to its router, Mbit/s, however many read", format!("{uplink:.2}"));
         let planner = model.constant(2, 0) + model.constant(2, 1) * MAPS_HZ * self.layers;
         row("cores of a planner's reading, of all", format!("{planner:.4}, {:.0}", self.planners * planner));
+        let every_server_lists = Self { listing: self.vehicles, ..*self };
+        if let Some((routers, limit)) = every_server_lists.routers(true, model) {
+            let announced = self.vehicles * (self.vehicles - 1.0);
+            row("if every server lists all: announcements, 1/s", format!("{announced:.0}"));
+            row("routers then, planners at any, and what asks for them", format!("{routers}, {limit}"));
+            // A received announcement is decoded and kept, as a map is.
+            row("cores of a server's list, at most", format!("{:.2}", self.vehicles * model.constant(2, 1)));
+        }
         row("recordings of all, TB/h; GB/s", {
             let gb = self.vehicles * RECORDING_GB;
             format!("{:.1}; {:.1}", 1e-3 * gb, gb / 3600.0)
@@ -139,30 +147,39 @@ impl Fleet {
         rows
     }
 
-    /// The vehicles, with as many planners each, at which each limit is met: with how many routers, and vehicles.
+    /// The number of vehicles, with as many planners each as here, at which each limit is met.
     pub fn limits(&self, model: &Model) -> Vec<(String, String)> {
         let readers = self.planners / self.vehicles;
         let with = |vehicles: f64| Self { vehicles, planners: readers * vehicles, ..*self };
-        let first = |is_over: &dyn Fn(f64) -> bool| (1..2_000_000).map(f64::from).find(|vehicles| is_over(*vehicles));
-        let one = |limit: usize, max: f64| {
-            first(&|vehicles| {
-                let of = with(vehicles).at(1.0, true, model);
-                [of.sessions, of.cores, of.bits][limit] > max
-            })
-        };
-        let every_server_lists = first(&|vehicles| {
-            let fleet = Self { listing: vehicles, ..with(vehicles) };
-            fleet.routers(true, model).is_none_or(|(routers, _)| {
-                routers > 2.0 * with(vehicles).routers(true, model).map_or(f64::INFINITY, |(routers, _)| routers)
-            })
-        });
-        let shown = |vehicles: Option<f64>| vehicles.map_or("never".into(), |vehicles| format!("{vehicles}"));
-        vec![
-            (format!("a router's {SESSIONS} sessions"), shown(one(0, SESSIONS))),
-            ("a router's four cores".into(), shown(one(1, self.cores_max / FILL))),
-            ("a router's link of 1 Gbit/s".into(), shown(one(2, self.bits_max / FILL))),
-            ("announcements, if every server lists: twice the routers".into(), shown(every_server_lists)),
-            ("a server's list of other vehicles".into(), "4096".into()),
-        ]
+        let one_router = |vehicles: f64| with(vehicles).at(1.0, true, model);
+        let routers = |fleet: Self| fleet.routers(true, model).map_or(f64::INFINITY, |(routers, _)| routers);
+        let is_twice =
+            |vehicles: f64| routers(Self { listing: vehicles, ..with(vehicles) }) >= 2.0 * routers(with(vehicles));
+        let limits: [(&str, &dyn Fn(f64) -> bool); 5] = [
+            ("one router: its 1,024 sessions", &|vehicles| one_router(vehicles).sessions > SESSIONS),
+            ("one router: its four cores", &|vehicles| one_router(vehicles).cores > self.cores_max / FILL),
+            ("one router: its link of 1 Gbit/s", &|vehicles| one_router(vehicles).bits > self.bits_max / FILL),
+            ("every server lists all: announcements ask for as many routers as all else", &is_twice),
+            ("joined routers: no number of them suffices", &|vehicles| routers(with(vehicles)).is_infinite()),
+        ];
+        let shown =
+            |(name, is_met): &(&str, &dyn Fn(f64) -> bool)| ((*name).to_owned(), format!("{:.0}", first(is_met)));
+        let mut limits: Vec<_> = limits.iter().map(shown).collect();
+        limits.push(("a server's list of the vehicles of others".into(), "4096".into()));
+        limits
     }
+}
+
+/// The least number of vehicles at which a limit is met, which it is then at every larger one; to one in a thousand.
+fn first(is_met: impl Fn(f64) -> bool) -> f64 {
+    let mut over = 1.0;
+    while !is_met(over) && over < 1e7 {
+        over *= 2.0;
+    }
+    let mut under = over / 2.0;
+    while over - under > (over * 1e-3).max(1.0) {
+        let middle = f64::floor((over + under) / 2.0);
+        *(if is_met(middle) { &mut over } else { &mut under }) = middle;
+    }
+    over
 }

@@ -59,6 +59,10 @@ const SETTLE: Duration = Duration::from_secs(4);
 /// Longest wait for the planners to be connected, and for maps.
 const PATIENCE: Duration = Duration::from_secs(60);
 
+/// Least share of the due maps that come, and of the processors that is idle, on a machine that is not starved.
+const CAME_MIN: f64 = 0.95;
+const IDLE_MIN: f64 = 0.05;
+
 /// What was measured at one size.
 struct Measured {
     /// One value for each of [`PARTS`].
@@ -89,34 +93,34 @@ fn grow(arguments: &Arguments) {
     let measured = FITTED.each_ref().map(|size| {
         let measured = run(size, SENSORS[0]);
         print_run(size, if size.is_moving { SENSORS[0] } else { "none" }, &measured);
-        measured.values
+        measured
     });
     let larger = Run::start(&LARGER, SENSORS[1], arguments);
     let announcement_bytes = larger.announcement_bytes();
     let larger = larger.measure(arguments.seconds);
     print_run(&LARGER, SENSORS[1], &larger);
-    let model = Model::fit(&FITTED, &measured);
+    let model = Model::fit(&FITTED, &measured.each_ref().map(|measured| measured.values.clone()));
     let checked = CHECKED.each_ref().map(|size| {
         let measured = run(size, SENSORS[0]);
         print_run(size, SENSORS[0], &measured);
         measured
     });
-    println!("\n| constant | |\n|---|---:|");
-    model.constants().iter().for_each(|(name, value)| println!("| {name} | {value} |"));
-    println!("| an announcement of a vehicle, kB | {:.3} |", 1e-3 * announcement_bytes);
     let of_larger = model.of_sensor(&LARGER, &larger.values);
-    of_larger
-        .constants()
-        .iter()
-        .zip(model.constants())
-        .filter(|(larger, own)| larger.1 != own.1)
-        .for_each(|((name, value), _)| println!("| {name}, {} | {value} |", SENSORS[1]));
+    println!("\n| constant | {} | {} |\n|---|---:|---:|", SENSORS[0], SENSORS[1]);
+    for ((name, value), (_, of_larger)) in model.constants().iter().zip(of_larger.constants()) {
+        let other = if of_larger == *value { "the same".into() } else { format!("{of_larger:.3}") };
+        println!("| {name} | {value:.3} | {other} |");
+    }
+    println!("| an announcement of a vehicle, kB | {:.3} | the same |", 1e-3 * announcement_bytes);
     println!("\n| vehicles, planners, routers | | predicted | measured | error, % |\n|---|---|---:|---:|---:|");
     for (size, measured) in CHECKED.iter().zip(&checked) {
         for ((part, predicted), value) in PARTS.iter().zip(model.predict(size)).zip(&measured.values) {
             let error = 100.0 * (predicted / value - 1.0);
             println!("| {size} | {} | {predicted:.3} | {value:.3} | {error:+.0} |", part.name);
         }
+    }
+    if measured.iter().chain(&checked).any(|measured| measured.came < CAME_MIN || measured.idle < IDLE_MIN) {
+        println!("\nThe processors had no time to spare at some size: its figures are those of a starved machine.");
     }
     let fleet = Fleet { announcement_bytes, ..Fleet::default() };
     println!("\n| {} vehicles, {} planners | |\n|---|---:|", fleet.vehicles, fleet.planners);
@@ -253,9 +257,9 @@ impl Run {
         let [_, _, maps, bytes, lost, late] = rates;
         let due = self.size.maps_delivered();
         let [all, idle] = [0, 1].map(|index| after.ticks[index] - before.ticks[index]);
-        let share = |part: f64| if due > 0.0 { part / due } else { 0.0 };
+        let share = |part: f64, without: f64| if due > 0.0 { part / due } else { without };
         let values = cores.into_iter().chain(memory_mib).chain([1e-6 * bytes]).collect();
-        Measured { values, came: share(maps), lost: share(lost), late: share(late), idle: idle / all }
+        Measured { values, came: share(maps, 1.0), lost: share(lost, 0.0), late: share(late, 0.0), idle: idle / all }
     }
 }
 
