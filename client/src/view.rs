@@ -23,8 +23,8 @@ const VALID_NS_MAX: i64 = 60_000_000_000;
 pub enum Staleness {
     /// Its validity has passed since it arrived, and no newer map has arrived.
     NoNewer,
-    /// Its validity had passed when it arrived: the link or the server delays maps, or the server's clock is behind this
-    /// machine's. One map does not tell which.
+    /// Its validity had passed when it arrived: the link or the server delays maps, or the server's clock is behind
+    /// this machine's. One map does not tell which.
     OnArrival {
         /// Age on arrival by this machine's clock, in ns.
         age_ns: i64,

@@ -3,10 +3,11 @@
 //!   cargo run --release -p clearway-tests --bin growth
 //!
 //! It starts real servers, the router of `deploy/` and planners as processes of this machine, without root; a simulated
-//! sensor sends each vehicle's packets over UDP, and each planner has a zenoh session of its own and reads two layers of
-//! one vehicle. Each [`Part`] of the model says what one group of processes takes as a sum of constants times numbers of
-//! the [`Size`]. The constants that fit the sizes of [`FITTED`] best (least squares of the relative errors, none below
-//! 0) predict the sizes of [`CHECKED`], which are then measured, and a fleet that this machine cannot hold.
+//! sensor sends each vehicle's packets over UDP, and each planner has a zenoh session of its own and reads two layers
+//! of one vehicle. The model ([`clearway_tests::growth`]) says what each group of processes takes as a sum of constants
+//! times numbers of the [`Size`]. The constants that fit the sizes of [`FITTED`] best (least squares of the relative
+//! errors, none below 0) predict the sizes of [`CHECKED`], which are then measured, and a fleet that this machine
+//! cannot hold.
 //!
 //! Processor time is that of `/proc/PID/stat`, which other programs on the machine disturb little; they still delay
 //! maps, so the table of the runs has the share of maps that came late, and of the processors that was idle.
