@@ -17,6 +17,8 @@ pub struct Fleet {
     pub layers: f64,
     /// Servers that list the vehicles of all (`zenoh.fleet.list`).
     pub listing: f64,
+    /// A map of one layer, in bytes.
+    pub map_bytes: f64,
     /// An announcement of a vehicle, in bytes.
     pub announcement_bytes: f64,
     /// Sessions that a router may be given.
@@ -38,14 +40,16 @@ const RECORDING_GB: f64 = 10.6;
 
 impl Default for Fleet {
     /// 1,000 vehicles, 10,000 planners with two layers each, ten servers that list all; routers with four cores and
-    /// links of 1 Gbit/s.
+    /// links of 1 Gbit/s. A map has the mean size of `drivability` and `speed` on recorded drives of an HDL-64E
+    /// (BENCHMARKS.md, "Agreement"): those of the simulated town are smaller.
     fn default() -> Self {
         Self {
             vehicles: 1000.0,
             planners: 10_000.0,
             layers: 2.0,
             listing: 10.0,
-            announcement_bytes: 1000.0,
+            map_bytes: 4800.0,
+            announcement_bytes: 500.0,
             sessions_max: FILL * SESSIONS,
             cores_max: FILL * 4.0,
             bits_max: FILL * 1e9,
@@ -71,8 +75,6 @@ pub struct PerRouter {
 impl Fleet {
     /// What each of so many routers is given. A vehicle's readers are at any router, or all at the vehicle's own.
     pub fn at(&self, routers: f64, is_anywhere: bool, model: &Model) -> PerRouter {
-        let map_bytes = 1e6 * model.constant(6, 0) + HEADER_BYTES;
-        let announcement_bytes = self.announcement_bytes + HEADER_BYTES;
         // Routers, other than the vehicle's own, at which at least one of its readers is.
         let readers = self.planners / self.vehicles;
         let others = if is_anywhere { (routers - 1.0) * (1.0 - (1.0 - 1.0 / routers).powf(readers)) } else { 0.0 };
@@ -85,12 +87,15 @@ impl Fleet {
         let announced_across = self.vehicles * (listing_routers - 1.0).max(0.0);
         let received = maps_hz + crossing + self.vehicles + announced_across;
         let sent = delivered + crossing + announced + announced_across;
-        let bits = 8.0 * ((delivered + crossing) * map_bytes + (announced + announced_across) * announcement_bytes);
+        // Of eleven messages of a layer ten are maps.
+        let maps_sent = (delivered + crossing) * MAPS_HZ / (MAPS_HZ + 1.0);
+        let announcements_sent = announced + announced_across;
+        let bytes = sent * HEADER_BYTES + maps_sent * self.map_bytes + announcements_sent * self.announcement_bytes;
         let sessions = (self.planners + self.vehicles) / routers + routers - 1.0;
         let cores =
             model.constant(1, 0) * sessions + (model.constant(1, 1) * received + model.constant(1, 2) * sent) / routers;
         let messages = [received / routers, sent / routers];
-        PerRouter { sessions, messages, cores, bits: bits / routers, crossing: crossing / routers }
+        PerRouter { sessions, messages, cores, bits: 8.0 * bytes / routers, crossing: crossing / routers }
     }
 
     /// The shares of what one router may be given: of sessions, cores and bits.
@@ -127,8 +132,7 @@ impl Fleet {
         let server = model.constant(0, 0) * MAPS_HZ + model.constant(0, 1);
         row("cores of a vehicle's server, of all", format!("{server:.2}, {:.0}", self.vehicles * server));
         row("memory of a vehicle's server, MiB", format!("{:.0}", model.constant(3, 0) + model.constant(3, 1)));
-        let map_bytes = 1e6 * model.constant(6, 0) + HEADER_BYTES;
-        let uplink = 8e-6 * self.layers * MAPS_HZ * map_bytes;
+        let uplink = 8e-6 * self.layers * MAPS_HZ * (self.map_bytes + HEADER_BYTES);
         row("from a vehicle to its router, Mbit/s, however many read", format!("{uplink:.2}"));
         let planner = model.constant(2, 0) + model.constant(2, 1) * MAPS_HZ * self.layers;
         row("cores of a planner's reading, of all", format!("{planner:.4}, {:.0}", self.planners * planner));

@@ -19,6 +19,10 @@ use clearway_sim::vehicle::SimulatedVehicle;
 
 use crate::packets::{packets, send};
 
+/// The environment of a router, as in `deploy/`: a thread that closes the connection of a peer behind a cut link is
+/// blocked for up to 10 s (zenoh lets the socket linger), and with zenoh's two threads that receive, two such peers stop
+/// a router.
+pub const ROUTER_ENVIRONMENT: (&str, &str) = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))");
 /// Layers that a planner reads.
 pub const LAYERS: [&str; 2] = ["drivability", "speed"];
 /// Age of a map that arrives late, in ms: the default validity.
@@ -287,4 +291,17 @@ pub fn last_line(process: &mut Process) -> Arc<Mutex<String>> {
         }
     });
     last
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_routers_of_deploy_have_the_environment_of_those_that_are_measured() {
+        for file in ["container/compose.yaml", "kubernetes/router.yaml", "README.md"] {
+            let text = std::fs::read_to_string(crate::workspace().join("deploy").join(file)).expect("it is there");
+            assert!(text.contains(ROUTER_ENVIRONMENT.0) && text.contains(ROUTER_ENVIRONMENT.1), "{file}");
+        }
+    }
 }

@@ -22,7 +22,7 @@ use clap::Parser;
 use clearway::config::Udp;
 use clearway_tests::growth::{Model, PARTS, Size};
 use clearway_tests::larger_fleet::Fleet;
-use clearway_tests::roles::{Process, Role, last_line, name, server_binary, server_config};
+use clearway_tests::roles::{Process, ROUTER_ENVIRONMENT, Role, last_line, name, server_binary, server_config};
 use zenoh::Wait;
 
 /// How far a fleet grows.
@@ -167,7 +167,12 @@ impl Run {
         let at: Vec<_> = (0..size.routers).map(|_| format!("tcp/{}", free_tcp())).collect();
         // Each two routers are joined by one of them.
         let others = |router: usize| at[..router].join(",");
-        let routers = (0..size.routers).map(|router| role(&["router", &at[router], &others(router)])).collect();
+        let routers = (0..size.routers).map(|router| {
+            let mut command = Command::new(&own);
+            command.env(ROUTER_ENVIRONMENT.0, ROUTER_ENVIRONMENT.1);
+            Process::start(command.args(["router", &at[router], &others(router)]))
+        });
+        let routers = routers.collect();
         let folder = tempfile::tempdir().expect("a folder");
         let sockets: Vec<SocketAddr> = (0..size.vehicles).map(|_| free_udp()).collect();
         let servers = (0..size.servers()).map(|server| {

@@ -19,7 +19,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use clearway_tests::roles::{Process, Role, name, server_binary, server_config};
+use clearway_tests::roles::{Process, ROUTER_ENVIRONMENT, Role, name, server_binary, server_config};
 
 /// Faults between machines.
 #[derive(Parser)]
@@ -205,7 +205,9 @@ impl Bed {
 
     fn start_router(&mut self, index: usize) {
         let name = ["r1", "r2"][index];
-        self.start(name, name, "", &["router", "tcp/0.0.0.0:7447", ROUTERS[1 - index]]);
+        let mut command = command(name, "", &self.own, &["router", "tcp/0.0.0.0:7447", ROUTERS[1 - index]]);
+        command.env(ROUTER_ENVIRONMENT.0, ROUTER_ENVIRONMENT.1);
+        self.processes.insert(name.into(), Process::start(&mut command));
     }
 
     /// Starts the server of this machine with these vehicles.
@@ -221,9 +223,9 @@ impl Bed {
         self.processes.insert(name, process);
     }
 
-    /// Changes the links of a server to both routers.
-    fn links(&mut self, server: &str, delay_ms: u32, loss: f64) {
-        ["r1", "r2"].iter().for_each(|router| self.hub.link(server, router, delay_ms, loss));
+    /// Changes the links of a server or planner to both routers.
+    fn links(&mut self, machine: &str, delay_ms: u32, loss: f64) {
+        ["r1", "r2"].iter().for_each(|router| self.hub.link(machine, router, delay_ms, loss));
     }
 
     /// Starts a server with its vehicles, and the sender of their scans.
@@ -356,6 +358,13 @@ fn faults() -> Vec<Fault> {
             of[0],
             |bed| bed.hub.link("s1", "r1", 0, 1.0),
             |bed| bed.hub.link("s1", "r1", 0, 0.0),
+        ),
+        fault(
+            "cut-planner",
+            "the links of p2 are cut",
+            |_, planner, _| planner == "p2",
+            |bed| bed.links("p2", 0, 1.0),
+            |bed| bed.links("p2", 0, 0.0),
         ),
         fault(
             "cut-routers",
