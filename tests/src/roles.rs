@@ -20,9 +20,10 @@ use clearway_sim::vehicle::SimulatedVehicle;
 use crate::packets::{packets, send};
 
 /// The environment of a router, as in `deploy/`: a thread that closes the connection of a peer behind a cut link is
-/// blocked for up to 10 s (zenoh lets the socket linger), and with zenoh's two threads that receive, two such peers stop
-/// a router.
+/// blocked for up to 10 s, because zenoh lets the socket linger. With zenoh's two threads that receive, two such peers
+/// stop a router.
 pub const ROUTER_ENVIRONMENT: (&str, &str) = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))");
+
 /// Layers that a planner reads.
 pub const LAYERS: [&str; 2] = ["drivability", "speed"];
 /// Age of a map that arrives late, in ms: the default validity.
