@@ -7,6 +7,7 @@
 //! | `clearway_python` | `python3` with the modules `venv` and `ensurepip` |
 //! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
 //! | `clearway_deploy` | the tools that lint and start `deploy/`: those of [`DEPLOY`], as root |
+//! | `clearway_namespaces` | what `machines` needs: those of [`NAMESPACES`], as root, and `/dev/net/tun` |
 //! | `clearway_browser` | `chromium` and `chromedriver` |
 //! | `clearway_promtool` | `promtool`, which comes with Prometheus |
 //!
@@ -26,6 +27,15 @@ const DEPLOY: [(&str, &[&str]); 8] = [
     ("mmdebstrap", &["--version"]),
     ("strip", &["--version"]),
     ("ip", &["-Version"]),
+    // Only root may make namespaces.
+    ("unshare", &["--mount", "--net", "true"]),
+];
+
+/// Programs that make machines with links and clocks of their own, with such an argument.
+const NAMESPACES: [(&str, &[&str]); 4] = [
+    ("ip", &["-Version"]),
+    ("python3", &["--version"]),
+    ("faketime", &["--version"]),
     // Only root may make namespaces.
     ("unshare", &["--mount", "--net", "true"]),
 ];
@@ -51,6 +61,8 @@ fn main() {
     set("clearway_promtool", succeeds("promtool", &["--version"]));
     let can_deploy = DEPLOY.iter().all(|(program, arguments)| succeeds(program, arguments));
     set("clearway_deploy", can_deploy && succeeds("python3", &["-c", "import venv, ensurepip"]));
+    let has_namespaces = NAMESPACES.iter().all(|(program, arguments)| succeeds(program, arguments));
+    set("clearway_namespaces", has_namespaces && Path::new("/dev/net/tun").exists());
     set("clearway_browser", succeeds("chromium", &["--version"]) && succeeds("chromedriver", &["--version"]));
 }
 

@@ -67,6 +67,11 @@ impl Arrival {
         self.age_ns.saturating_add(self.since_ns())
     }
 
+    /// Age of the map when it arrived, in ns, by the wall clock; 0 if it was captured in that clock's future.
+    pub fn age_on_arrival_ns(&self) -> i64 {
+        self.age_ns
+    }
+
     /// Time since the arrival, in ns, by the steady clock.
     pub fn since_ns(&self) -> i64 {
         (self.clock.steady_ns)().saturating_sub(self.steady_ns)

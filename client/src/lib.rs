@@ -59,7 +59,7 @@ pub use observation::{Observation, Refusal};
 #[cfg(feature = "zenoh")]
 pub use signature::PublicKey;
 pub use stream::{MapStream, PassedOver, StreamEvent, Update};
-pub use view::MapView;
+pub use view::{MapView, Staleness};
 #[cfg(feature = "zenoh")]
 pub use zenoh::ZenohClient;
 

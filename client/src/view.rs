@@ -3,6 +3,7 @@
 //! In: an encoded `clearway.v1.Map` from any transport. Out: header, layers and look-ups in the ego frame (x forward, y
 //! left, metres), and the age, measured from the end of the capture.
 
+use std::fmt;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -16,6 +17,43 @@ use crate::freshness::{Arrival, Clock, now_ns};
 /// Longest time after its capture for which a map is believed to be valid, whatever it states: a forged map is not
 /// fresh for good. Ours: far longer than any planner uses a map.
 const VALID_NS_MAX: i64 = 60_000_000_000;
+
+/// Why a map must not be used. [`fmt::Display`] says it in a sentence.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Staleness {
+    /// Its validity has passed since it arrived, and no newer map has arrived.
+    NoNewer,
+    /// Its validity had passed when it arrived: the link or the server delays maps, or the server's clock is behind
+    /// this machine's. One map does not tell which.
+    OnArrival {
+        /// Age on arrival by this machine's clock, in ns.
+        age_ns: i64,
+    },
+    /// Its capture is in the future of this machine's clock, so that the clocks differ.
+    InTheFuture {
+        /// Time from now until the capture, in ns: at least so far the server's clock is ahead of this machine's.
+        ahead_ns: i64,
+    },
+}
+
+impl fmt::Display for Staleness {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ms = |ns: i64| ns as f64 * 1e-6;
+        match self {
+            Self::NoNewer => formatter.write_str("no newer map has arrived"),
+            Self::OnArrival { age_ns } => write!(
+                formatter,
+                "it was {:.0} ms old when it arrived: maps are delayed, or the server's clock is behind this machine's",
+                ms(*age_ns)
+            ),
+            Self::InTheFuture { ahead_ns } => write!(
+                formatter,
+                "it was captured {:.0} ms in the future: the server's clock is ahead of this machine's",
+                ms(*ahead_ns)
+            ),
+        }
+    }
+}
 
 /// A map, decoded once. A clone shares the decoded map.
 #[derive(Clone, Debug)]
@@ -120,8 +158,20 @@ impl MapView {
     /// True if the map must not be used at `now_ns`: its validity has passed, or its capture is so far in the future of
     /// this clock that its age cannot be known.
     pub fn is_stale(&self, now_ns: i64) -> bool {
+        self.staleness(now_ns).is_some()
+    }
+
+    /// Why the map must not be used at `now_ns`; `None` if it may be used.
+    pub fn staleness(&self, now_ns: i64) -> Option<Staleness> {
         let ahead_ns = self.map.header.capture_end_ns.saturating_sub(now_ns);
-        self.age_ns(now_ns) > self.valid_ns() || ahead_ns > self.valid_ns()
+        if ahead_ns > self.valid_ns() {
+            return Some(Staleness::InTheFuture { ahead_ns });
+        }
+        let age_on_arrival_ns = self.arrival.as_ref().map_or(0, |arrival| arrival.age_on_arrival_ns());
+        if age_on_arrival_ns > self.valid_ns() {
+            return Some(Staleness::OnArrival { age_ns: age_on_arrival_ns });
+        }
+        (self.age_ns(now_ns) > self.valid_ns()).then_some(Staleness::NoNewer)
     }
 
     /// Time from now until the map is stale, in ns; `None` if it is stale.

@@ -12,7 +12,7 @@
 //! processor time of a map went to.
 
 use std::io::{BufRead, BufReader};
-use std::net::{SocketAddr, UdpSocket};
+use std::net::SocketAddr;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -24,19 +24,16 @@ use clearway::server::{Server, Setup};
 use clearway_client::{Client, Observation, Subscription, now_ns};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
-use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
+use clearway_sim::vehicle::{Datagram, SimulatedVehicle};
+use clearway_tests::packets::{REVOLUTION, later, packets, send};
 use tokio::task::JoinSet;
 
 /// Time after which readers are connected and memory is allocated; maps until then are not counted.
 const SETTLE: Duration = Duration::from_secs(3);
 /// Time between two poses of a vehicle.
 const POSE_PERIOD: Duration = Duration::from_millis(50);
-/// Time of a revolution.
-const REVOLUTION: Duration = Duration::from_millis(100);
 /// Threads that send.
 const SENDERS: usize = 2;
-/// Time before its due time within which a packet is sent without waiting.
-const BURST: Duration = Duration::from_millis(1);
 /// The layers that are read.
 const LAYERS: [&str; 2] = ["drivability", "speed"];
 
@@ -67,7 +64,8 @@ fn main() {
         return runtime.block_on(serve(vehicles));
     }
     let length = SETTLE + Duration::from_secs(arguments.seconds) + 2 * REVOLUTION;
-    let drive: Arc<[Datagram]> = packets(length).into();
+    let vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
+    let drive: Arc<[Datagram]> = packets(vehicle, length).into();
     println!(
         "| vehicles | maps/s | age p50 / p99 / worst ms | maps missed | datagrams lost | MiB a vehicle | server's cores \
          | ms a map: engine / UDP / all else |"
@@ -76,14 +74,6 @@ fn main() {
     for &vehicles in &arguments.vehicles {
         println!("{}", runtime.block_on(measure(vehicles, &arguments, &drive)));
     }
-}
-
-/// The data packets of a drive of this length.
-fn packets(length: Duration) -> Vec<Datagram> {
-    let vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
-    let mut data = vehicle.filter(|datagram| datagram.kind != Kind::Telemetry).peekable();
-    let first_ns = data.peek().expect("datagrams do not end").stamp_ns;
-    data.take_while(|datagram| datagram.stamp_ns - first_ns < length.as_nanos() as i64).collect()
 }
 
 /// Runs one row.
@@ -148,11 +138,6 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
     )
 }
 
-/// How much later than the first vehicle one with this number begins: the revolutions end evenly spread.
-fn later(number: usize, vehicles: usize) -> Duration {
-    REVOLUTION.mul_f64(number as f64 / vehicles as f64)
-}
-
 fn name(number: usize) -> String {
     format!("v{number:02}")
 }
@@ -192,36 +177,6 @@ async fn send_poses(client: Client, vehicle: String) {
         if ingester.send(pose).await.is_err() {
             return;
         }
-    }
-}
-
-/// Sends the drive in real time from `start` on to each of these vehicles.
-fn send(drive: &[Datagram], to: &[(usize, SocketAddr)], vehicles: usize, start: Instant, sent: &AtomicU64) {
-    let sockets: Vec<_> = to
-        .iter()
-        .map(|(number, address)| {
-            let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
-            socket.connect(address).expect("loopback");
-            (socket, later(*number, vehicles))
-        })
-        .collect();
-    let first_ns = drive[0].stamp_ns;
-    let due = |at: usize| Duration::from_nanos(drive[at].stamp_ns.abs_diff(first_ns));
-    let mut next = vec![0; sockets.len()];
-    while next.iter().any(|at| *at < drive.len()) {
-        let mut wait = REVOLUTION;
-        for ((socket, later), at) in sockets.iter().zip(&mut next) {
-            while *at < drive.len() && due(*at) + *later <= start.elapsed() + BURST && Instant::now() >= start {
-                // A full socket buffer drops the packet, as a network would; the server's counts tell.
-                let _ = socket.send(&drive[*at].payload);
-                sent.fetch_add(1, Ordering::Relaxed);
-                *at += 1;
-            }
-            if *at < drive.len() {
-                wait = wait.min((due(*at) + *later).saturating_sub(start.elapsed() + BURST));
-            }
-        }
-        std::thread::sleep(wait);
     }
 }
 

@@ -8,8 +8,15 @@ use std::sync::OnceLock;
 pub mod attack;
 pub mod damage;
 pub mod digests;
+pub mod packets;
 pub mod simulation;
 
+#[cfg(feature = "siege")]
+pub mod growth;
+#[cfg(feature = "siege")]
+pub mod larger_fleet;
+#[cfg(feature = "siege")]
+pub mod roles;
 #[cfg(feature = "siege")]
 pub mod siege;
 

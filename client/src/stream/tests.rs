@@ -9,6 +9,7 @@ use futures::FutureExt;
 use tokio::sync::oneshot;
 
 use super::*;
+use crate::view::Staleness;
 
 const MS: i64 = 1_000_000;
 const START_NS: i64 = 1_700_000_000_000_000_000;
@@ -184,6 +185,26 @@ async fn a_step_of_the_wall_clock_makes_no_stale_map_fresh() {
     assert_eq!(bed.next().await, (false, 0, 40 * MS));
     bed.step(1000 * MS);
     assert_eq!(bed.next().await, (true, 0, 1040 * MS));
+}
+
+#[tokio::test]
+async fn a_stale_map_says_whether_the_clocks_differ_or_no_newer_map_came() {
+    let mut bed = TestBed::new();
+    for (sequence, (age_ms, expected)) in (0..).zip([
+        (40, None),
+        (-40, None),
+        (2000, Some(Staleness::OnArrival { age_ns: 2000 * MS })),
+        (-2000, Some(Staleness::InTheFuture { ahead_ns: 2000 * MS })),
+        (20, None),
+    ]) {
+        bed.pass(100 * MS);
+        bed.store_aged(7, sequence, age_ms * MS);
+        let newest = bed.stream.newest().expect("a map was stored");
+        assert_eq!(newest.staleness(bed.wall_ns.load(Ordering::SeqCst)), expected, "aged {age_ms} ms");
+    }
+    bed.pass(300 * MS);
+    let newest = bed.stream.newest().expect("a map was stored");
+    assert_eq!(newest.staleness(bed.wall_ns.load(Ordering::SeqCst)), Some(Staleness::NoNewer));
 }
 
 #[test]

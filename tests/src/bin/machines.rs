@@ -1,11 +1,15 @@
-//! Faults between machines: three servers, two routers, 20 vehicles and two planners, each machine in a network
-//! namespace of its own, with IP links between them that are cut, slowed and repaired. It needs root.
+//! Faults between machines: three servers, two routers, vehicles and two planners, each machine in a network namespace
+//! of its own, with IP links between them that are cut, slowed and repaired. It needs root.
 //!
 //!   cargo run --release -p clearway-tests --bin machines
+//!   cargo run --release -p clearway-tests --bin machines -- --faults cut,clock-behind --seconds 3
 //!
 //! Each planner reads every vehicle over zenoh. For each fault the table has, of all streams, how many went STALE while
-//! it lasted, of the vehicles it concerns and of the others; how long the longest of the others was; the time from the
-//! repair until every stream was fresh again; and how many streams had maps of another run of a server than before.
+//! it lasted, of those it concerns and of the others; how long the longest of the others was; the time from the repair
+//! until every stream was fresh again; how many streams had maps of another run of a server than before; and why the
+//! concerned streams said they were stale, with their number.
+//!
+//! A clock is set by libfaketime (Debian: `apt-get install faketime`) for the processes of one machine.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, BufReader, Write};
@@ -14,9 +18,8 @@ use std::process::{Child, ChildStdin, Command, ExitCode, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use clap::{Parser, Subcommand};
-use clearway::config::{Config, ZenohMode};
-use clearway_client::{Client, Observation, StreamEvent, ZenohClient, now_ns};
+use clap::Parser;
+use clearway_tests::roles::{Process, ROUTER_ENVIRONMENT, Role, name, server_binary, server_config};
 
 /// Faults between machines.
 #[derive(Parser)]
@@ -26,114 +29,38 @@ struct Arguments {
     /// Time for which each fault lasts, in seconds.
     #[arg(long, default_value_t = 8.0)]
     seconds: f64,
+    /// Number of vehicles, shared by the three servers.
+    #[arg(long, default_value_t = 20)]
+    vehicles: usize,
+    /// Validity of a map, in ms.
+    #[arg(long, default_value_t = 300)]
+    valid_ms: u32,
+    /// The faults that are made; all by default.
+    #[arg(long, value_delimiter = ',')]
+    faults: Vec<String>,
     /// The server's binary; by default `clearway` beside this one.
     #[arg(long)]
     server: Option<PathBuf>,
 }
 
-/// What a process of the run does in its namespace.
-#[derive(Subcommand)]
-enum Role {
-    /// Sends scans of these vehicles to the server of this machine.
-    Feed { vehicles: String },
-    /// Prints when a stream of one of these vehicles becomes stale or fresh, or changes its server.
-    Read { endpoints: String, vehicles: String },
-    /// A router, connected to others.
-    Router { others: String },
-}
-
 const HOSTS: &str = "r1:1 r2:2 s1:11 s2:12 s3:13 p1:21 p2:22";
 const ROUTERS: [&str; 2] = ["tcp/10.99.0.1:7447", "tcp/10.99.0.2:7447"];
-/// Vehicles of each server.
-const VEHICLES: [std::ops::Range<usize>; 3] = [0..7, 7..14, 14..20];
+const SERVERS: [&str; 3] = ["s1", "s2", "s3"];
+const PLANNERS: [&str; 2] = ["p1", "p2"];
 /// The vehicle that two servers claim for a while.
 const CLAIMED: &str = "v00";
 /// Longest wait for the fleet to be whole.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Time for which a fleet is whole before the next fault.
+const CALM: Duration = Duration::from_secs(2);
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().expect("a runtime");
     match &arguments.role {
-        Some(Role::Feed { vehicles }) => runtime.block_on(feed(vehicles)),
-        Some(Role::Read { endpoints, vehicles }) => runtime.block_on(read(endpoints, vehicles)),
-        Some(Role::Router { others }) => runtime.block_on(route(others)),
+        Some(role) => role.run(),
         None => return run(&arguments),
     }
     ExitCode::SUCCESS
-}
-
-fn names(range: std::ops::Range<usize>) -> Vec<String> {
-    range.map(|number| format!("v{number:02}")).collect()
-}
-
-/// Ten scans a second of each vehicle: a plain, 1,440 points.
-async fn feed(vehicles: &str) {
-    let rays = || (0..1440_u32).map(|ray| (f64::from(ray).to_radians(), 3.0 + f64::from(ray / 360) * 4.0));
-    let list = |of: &dyn Fn(f64, f64) -> f64| rays().map(|(angle, range_m)| of(angle, range_m) as f32).collect();
-    let x: Vec<f32> = list(&|angle, range_m| angle.cos() * range_m);
-    let y: Vec<f32> = list(&|angle, range_m| angle.sin() * range_m);
-    let z: Vec<f32> = list(&|_, _| -2.0);
-    let feeds = vehicles.split(',').map(|vehicle| async {
-        let mut every = tokio::time::interval(Duration::from_millis(100));
-        loop {
-            every.tick().await;
-            let Ok(client) = Client::connect("127.0.0.1:50051").await else { continue };
-            let Ok(mut ingester) = client.ingest(vehicle).await else { continue };
-            while ingester.send(Observation::scan("top", now_ns(), &x, &y, &z)).await.is_ok() {
-                every.tick().await;
-            }
-        }
-    });
-    futures::future::join_all(feeds).await;
-}
-
-/// Follows every vehicle; ends with its standard input.
-async fn read(endpoints: &str, vehicles: &str) {
-    let client = loop {
-        match ZenohClient::connect(endpoints).await {
-            Ok(client) => break client,
-            Err(_) => tokio::time::sleep(Duration::from_millis(100)).await,
-        }
-    };
-    let streams = vehicles.split(',').map(|vehicle| {
-        let client = client.clone();
-        async move {
-            let (mut was_fresh, mut run) = (false, 0);
-            let mut maps = client.subscribe(vehicle, "drivability").await.expect("a subscription");
-            while let Ok(event) = maps.next_or_stale().await {
-                let (is_fresh, update) = match event {
-                    StreamEvent::Fresh(update) => (true, update),
-                    StreamEvent::Stale(update) => (false, update),
-                };
-                let boot_id = update.map.header().boot_id;
-                if boot_id != run {
-                    println!("{vehicle} run {boot_id}");
-                    run = boot_id;
-                }
-                if is_fresh != was_fresh {
-                    println!("{vehicle} {}", if is_fresh { "fresh" } else { "stale" });
-                    was_fresh = is_fresh;
-                }
-            }
-        }
-    });
-    futures::future::join_all(streams).await;
-}
-
-/// The router of `deploy/`, in plain text and without access control.
-async fn route(others: &str) {
-    let file = clearway_tests::workspace().join("deploy/zenoh/router.json5");
-    let text = std::fs::read_to_string(file).expect("a file of the repository");
-    let text = text.replace("tls/0.0.0.0:7447", "tcp/0.0.0.0:7447");
-    let mut config = zenoh::Config::from_json5(&text).expect("a configuration");
-    config.insert_json5("access_control/enabled", "false").expect("a setting of zenoh");
-    let others: Vec<_> = others.split(',').collect();
-    config.insert_json5("connect/endpoints", &format!("{others:?}")).expect("a setting of zenoh");
-    config.insert_json5("connect/timeout_ms", "0").expect("a setting of zenoh");
-    let _router = zenoh::open(config).await.expect("the port is free");
-    std::future::pending::<()>().await;
 }
 
 /// What one stream has shown.
@@ -144,26 +71,31 @@ struct Shown {
     /// Periods in which it was stale.
     stale: Vec<(Instant, Instant)>,
     runs: Vec<u64>,
+    /// Why it said that it was stale, and when.
+    said: Vec<(Instant, String)>,
 }
 
 type Streams = Arc<Mutex<BTreeMap<(&'static str, String), Shown>>>;
 
-/// A process in the namespace of a machine; it is killed at the end.
-struct Process(Child);
-
-impl Process {
-    fn start(machine: &str, program: &Path, arguments: &[&str]) -> Self {
-        let mut command = Command::new("ip");
-        command.args(["netns", "exec", machine]).arg(program).args(arguments).stderr(Stdio::null());
-        Self(command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn().expect("ip is installed"))
+/// A program in the namespace of a machine, by a clock that is this much ahead, such as `+2s`; empty: by the true one.
+fn command(machine: &str, clock: &str, program: &Path, arguments: &[&str]) -> Command {
+    let mut command = Command::new("ip");
+    command.args(["netns", "exec", machine]);
+    if !clock.is_empty() {
+        let library = faketime().expect("libfaketime: apt-get install faketime");
+        let settings = [format!("LD_PRELOAD={}", library.display()), format!("FAKETIME={clock}")];
+        // A host's clock that is set does not move its steady clock.
+        command.arg("env").args(settings).args(["DONT_FAKE_MONOTONIC=1", "FAKETIME_DONT_FAKE_MONOTONIC=1"]);
     }
+    command.arg(program).args(arguments);
+    command
 }
 
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ended = self.0.kill();
-        let _reaped = self.0.wait();
-    }
+/// The library of the Debian package that sets the clock of a program with several threads.
+fn faketime() -> Option<PathBuf> {
+    let architectures = std::fs::read_dir("/usr/lib").ok()?.flatten();
+    let mut libraries = architectures.map(|folder| folder.path().join("faketime/libfaketimeMT.so.1"));
+    libraries.find(|library| library.is_file())
 }
 
 /// The links between the machines.
@@ -197,27 +129,52 @@ impl Drop for Hub {
     }
 }
 
-/// Follows the lines of a reader.
+/// Follows the lines of a reader. A reader that has ended has no fresh map.
 fn follow(planner: &'static str, process: &mut Process, streams: &Streams) {
     let (lines, streams) = (BufReader::new(process.0.stdout.take().expect("piped")), streams.clone());
     std::thread::spawn(move || {
         for line in lines.lines().map_while(Result::ok) {
             let mut words = line.split(' ');
-            let (Some(vehicle), Some(what), run) = (words.next(), words.next(), words.next()) else { continue };
+            let (Some(vehicle), Some(what), more) = (words.next(), words.next(), words.next()) else { continue };
             let (mut streams, now) = (streams.lock().expect("no panic"), Instant::now());
             let shown = streams.entry((planner, vehicle.to_owned())).or_default();
             match what {
-                "run" => shown.runs.extend(run.and_then(|run| run.parse::<u64>().ok())),
+                "run" => shown.runs.extend(more.and_then(|run| run.parse::<u64>().ok())),
                 "fresh" => {
-                    if let Some(since) = shown.since.replace(now) {
+                    if let Some(since) = shown.since.take() {
                         shown.stale.push((since, now));
                     }
                     shown.is_fresh = true;
                 }
-                _ => (shown.is_fresh, shown.since) = (false, Some(now)),
+                _ => {
+                    shown.said.extend(more.map(|why| (now, why.to_owned())));
+                    shown.end(now);
+                }
             }
         }
+        let mut streams = streams.lock().expect("no panic");
+        let of_planner = streams.iter_mut().filter(|((of, _), _)| *of == planner);
+        of_planner.for_each(|(_, shown)| shown.end(Instant::now()));
     });
+}
+
+impl Shown {
+    fn end(&mut self, now: Instant) {
+        self.is_fresh = false;
+        self.since.get_or_insert(now);
+    }
+}
+
+/// True if a fault concerns the stream of a planner and a vehicle.
+type Concerns = fn(&Bed, &str, &str) -> bool;
+
+/// A fault: its name for `--faults`, what the table calls it, the streams it concerns, how it is made and repaired.
+struct Fault {
+    name: &'static str,
+    title: &'static str,
+    concerns: Concerns,
+    make: fn(&mut Bed),
+    repair: fn(&mut Bed),
 }
 
 /// The run: what is started, and what the streams show.
@@ -228,39 +185,66 @@ struct Bed {
     hub: Hub,
     processes: BTreeMap<String, Process>,
     streams: Streams,
+    /// The vehicles of each server.
+    vehicles: [Vec<String>; 3],
     seconds: f64,
+    valid_ms: u32,
 }
 
 impl Bed {
-    fn start(&mut self, name: &str, machine: &str, arguments: &[&str]) {
-        let process = Process::start(machine, &self.own.clone(), arguments);
+    /// Starts a role of this binary instead of the process of the same name.
+    fn start(&mut self, name: &str, machine: &str, clock: &str, arguments: &[&str]) {
+        self.stop(&[name]);
+        let process = Process::start(&mut command(machine, clock, &self.own, arguments));
         self.processes.insert(name.into(), process);
     }
 
+    fn stop(&mut self, names: &[&str]) {
+        names.iter().for_each(|name| drop(self.processes.remove(*name)));
+    }
+
     fn start_router(&mut self, index: usize) {
-        self.start(["r1", "r2"][index], ["r1", "r2"][index], &["router", ROUTERS[1 - index]]);
+        let name = ["r1", "r2"][index];
+        let mut command = command(name, "", &self.own, &["router", "tcp/0.0.0.0:7447", ROUTERS[1 - index]]);
+        command.env(ROUTER_ENVIRONMENT.0, ROUTER_ENVIRONMENT.1);
+        self.processes.insert(name.into(), Process::start(&mut command));
     }
 
     /// Starts the server of this machine with these vehicles.
-    fn start_server(&mut self, machine: &str, vehicles: &[String]) {
-        let mut config = Config::of_one_vehicle(CLAIMED, "top");
-        let vehicle = config.vehicles.remove(0);
-        config.vehicles =
-            vehicles.iter().map(|name| clearway::config::Vehicle { name: name.clone(), ..vehicle.clone() }).collect();
-        config.vehicles.iter_mut().for_each(|vehicle| vehicle.udp = None);
-        config.page.enabled = false;
-        config.zenoh.mode = ZenohMode::Client;
-        (config.zenoh.listen, config.zenoh.connect) = (Vec::new(), ROUTERS.map(str::to_owned).to_vec());
+    fn start_server(&mut self, machine: &str, clock: &str, vehicles: &[String]) {
+        let mut config = server_config(vehicles, &ROUTERS.map(str::to_owned));
+        config.vehicles.iter_mut().for_each(|vehicle| vehicle.maps.valid_ms = self.valid_ms);
         let file = self.folder.path().join(format!("{machine}.toml"));
         std::fs::write(&file, config.to_toml()).expect("a file of ours");
         let arguments = ["serve", "--config", file.to_str().expect("UTF-8")];
-        let process = Process::start(machine, &self.server.clone(), &arguments);
-        self.processes.insert(machine.into(), process);
+        let name = format!("{machine} server");
+        self.stop(&[&name]);
+        let process = Process::start(&mut command(machine, clock, &self.server, &arguments));
+        self.processes.insert(name, process);
+    }
+
+    /// Changes the links of a server or planner to both routers.
+    fn links(&mut self, machine: &str, delay_ms: u32, loss: f64) {
+        ["r1", "r2"].iter().for_each(|router| self.hub.link(machine, router, delay_ms, loss));
+    }
+
+    /// Starts a server with its vehicles, and the sender of their scans.
+    fn start_vehicles(&mut self, index: usize, clock: &str) {
+        let (machine, vehicles) = (SERVERS[index], self.vehicles[index].clone());
+        self.start_server(machine, clock, &vehicles);
+        self.start(&format!("{machine} feed"), machine, clock, &["feed", &vehicles.join(",")]);
+    }
+
+    fn start_planner(&mut self, index: usize, clock: &str) {
+        let (planner, all) = (PLANNERS[index], self.vehicles.concat().join(","));
+        let endpoints = [ROUTERS[index], ROUTERS[1 - index]].join(",");
+        self.start(planner, planner, clock, &["read", &endpoints, &all]);
+        follow(planner, self.processes.get_mut(planner).expect("just started"), &self.streams);
     }
 
     /// Waits until every stream is fresh; the time that it took.
     fn whole(&self) -> Option<Duration> {
-        let (began, streams) = (Instant::now(), 2 * VEHICLES[2].end);
+        let (began, streams) = (Instant::now(), PLANNERS.len() * self.vehicles.concat().len());
         loop {
             let shown = self.streams.lock().expect("no panic");
             if shown.len() == streams && shown.values().all(|shown| shown.is_fresh) {
@@ -275,125 +259,176 @@ impl Bed {
     }
 
     /// Makes a fault, waits, repairs it, and prints the line of the table.
-    fn fault(
-        &mut self,
-        name: &str,
-        concerned: &[String],
-        make: impl FnOnce(&mut Self),
-        repair: impl FnOnce(&mut Self),
-    ) {
+    fn suffer(&mut self, fault: &Fault) {
         let runs =
             |bed: &Self| bed.streams.lock().expect("no panic").values().map(|shown| shown.runs.len()).sum::<usize>();
         let (began, runs_before) = (Instant::now(), runs(self));
-        make(self);
+        (fault.make)(self);
         std::thread::sleep(Duration::from_secs_f64(self.seconds));
-        repair(self);
+        (fault.repair)(self);
         let repaired = Instant::now();
         let whole = self.whole();
-        let concerned: BTreeSet<_> = concerned.iter().collect();
-        let (mut stale, mut longest) = ([0; 2], Duration::ZERO);
-        for ((_, vehicle), shown) in &*self.streams.lock().expect("no panic") {
-            let is_concerned = concerned.contains(vehicle);
-            let periods = shown.stale.iter().copied().filter(|(_, end)| *end > began);
-            let open = shown.since.filter(|_| !shown.is_fresh).map(|since| (since, repaired));
-            let mut was_stale = false;
-            for (from, to) in periods.chain(open).filter(|(from, _)| *from < repaired) {
-                was_stale = true;
-                if !is_concerned {
-                    longest = longest.max(to.saturating_duration_since(from));
-                }
+        let (mut streams, mut stale, mut longest, mut said) = ([0; 2], [0; 2], Duration::ZERO, BTreeMap::new());
+        for ((planner, vehicle), shown) in &*self.streams.lock().expect("no panic") {
+            let is_other = !(fault.concerns)(self, planner, vehicle);
+            let open = shown.since.map(|since| (since, repaired));
+            let periods = shown.stale.iter().copied().filter(|(_, end)| *end > began).chain(open);
+            let periods: Vec<_> = periods.filter(|(from, _)| *from < repaired).collect();
+            streams[usize::from(is_other)] += 1;
+            stale[usize::from(is_other)] += usize::from(!periods.is_empty());
+            if is_other {
+                let longest_of_stream = periods.iter().map(|(from, to)| to.saturating_duration_since(*from)).max();
+                longest = longest.max(longest_of_stream.unwrap_or_default());
+            } else {
+                let of_fault = shown.said.iter().filter(|(at, _)| (began..repaired).contains(at));
+                let why: BTreeSet<_> = of_fault.map(|(_, why)| why.clone()).collect();
+                why.into_iter().for_each(|why| *said.entry(why).or_insert(0) += 1);
             }
-            stale[usize::from(!is_concerned)] += u32::from(was_stale);
         }
         let whole =
             whole.map_or(format!("not in {} s", PATIENCE.as_secs()), |whole| format!("{:.2}", whole.as_secs_f64()));
+        let said: Vec<_> = said.into_iter().map(|(why, streams)| format!("{why} {streams}")).collect();
         println!(
-            "| {name} | {} of {} | {} of {} | {:.2} | {whole} | {} |",
+            "| {} | {} of {} | {} of {} | {:.2} | {whole} | {} | {} |",
+            fault.title,
             stale[0],
-            2 * concerned.len(),
+            streams[0],
             stale[1],
-            2 * (VEHICLES[2].end - concerned.len()),
+            streams[1],
             longest.as_secs_f64(),
-            runs(self) - runs_before
+            runs(self) - runs_before,
+            said.join(", ")
         );
-        // What follows begins with a whole fleet that has been whole for a while.
-        std::thread::sleep(Duration::from_secs(2));
+        std::thread::sleep(CALM);
     }
 }
 
 fn run(arguments: &Arguments) -> ExitCode {
+    let (all, asked) = (faults(), &arguments.faults);
+    if let Some(unknown) = asked.iter().find(|name| all.iter().all(|fault| fault.name != **name)) {
+        let known: Vec<_> = all.iter().map(|fault| fault.name).collect();
+        eprintln!("no fault is named {unknown:?}; known: {}", known.join(", "));
+        return ExitCode::FAILURE;
+    }
+    let faults: Vec<_> =
+        all.into_iter().filter(|fault| asked.is_empty() || asked.iter().any(|name| name == fault.name)).collect();
     let own = std::env::current_exe().expect("the path of this binary");
-    let server = arguments.server.clone().unwrap_or_else(|| own.with_file_name("clearway"));
+    let server = server_binary(arguments.server.as_ref());
     let folder = tempfile::tempdir().expect("a folder");
     let (hub, processes, streams) = (Hub::start(), BTreeMap::new(), Streams::default());
-    let mut bed = Bed { own, server, folder, hub, processes, streams, seconds: arguments.seconds };
-    let of: Vec<_> = VEHICLES.into_iter().map(names).collect();
+    let share = arguments.vehicles.div_ceil(3);
+    let vehicles =
+        [0, 1, 2].map(|index| (index * share..((index + 1) * share).min(arguments.vehicles)).map(name).collect());
+    let (seconds, valid_ms) = (arguments.seconds, arguments.valid_ms);
+    let mut bed = Bed { own, server, folder, hub, processes, streams, vehicles, seconds, valid_ms };
     (0..2).for_each(|index| bed.start_router(index));
-    for (machine, vehicles) in ["s1", "s2", "s3"].into_iter().zip(&of) {
-        bed.start_server(machine, vehicles);
-        bed.start(&format!("{machine} feed"), machine, &["feed", &vehicles.join(",")]);
-    }
-    let all = names(0..VEHICLES[2].end).join(",");
-    for (planner, endpoints) in [("p1", ROUTERS.join(",")), ("p2", [ROUTERS[1], ROUTERS[0]].join(","))] {
-        let mut process = Process::start(planner, &bed.own, &["read", &endpoints, &all]);
-        follow(planner, &mut process, &bed.streams);
-        bed.processes.insert(planner.into(), process);
-    }
+    (0..3).for_each(|index| bed.start_vehicles(index, ""));
+    (0..2).for_each(|index| bed.start_planner(index, ""));
     let Some(whole) = bed.whole() else {
         eprintln!("not every stream is fresh after {PATIENCE:?}: {:?}", bed.streams.lock().expect("no panic").len());
         return ExitCode::FAILURE;
     };
     eprintln!("whole after {whole:?}");
     println!(
-        "| fault, {} s each | streams of its vehicles that went STALE | of the others | longest of the others, s \
-         | all fresh after the repair, s | streams with another run |\n|---|---:|---:|---:|---:|---:|",
+        "| fault, {} s each | streams it concerns that went STALE | of the others | longest of the others, s \
+         | all fresh after the repair, s | streams with another run | said by those it concerns |\n\
+         |---|---:|---:|---:|---:|---:|---|",
         bed.seconds
     );
-    faults(&mut bed, &of);
+    std::thread::sleep(CALM);
+    faults.iter().for_each(|fault| bed.suffer(fault));
     ExitCode::SUCCESS
 }
 
-fn faults(bed: &mut Bed, of: &[Vec<String>]) {
-    let cut = |bed: &mut Bed, loss| ["r1", "r2"].iter().for_each(|router| bed.hub.link("s1", router, 0, loss));
-    bed.fault("none", &[], |_| {}, |_| {});
-    bed.fault("the links of s1 are cut", &of[0], |bed| cut(bed, 1.0), |bed| cut(bed, 0.0));
-    bed.fault(
-        "the link of s1 to r1 is cut",
-        &of[0],
-        |bed| bed.hub.link("s1", "r1", 0, 1.0),
-        |bed| bed.hub.link("s1", "r1", 0, 0.0),
-    );
-    bed.fault(
-        "the link between the routers is cut",
-        &[],
-        |bed| bed.hub.link("r1", "r2", 0, 1.0),
-        |bed| bed.hub.link("r1", "r2", 0, 0.0),
-    );
-    let slow = |bed: &mut Bed, delay_ms, loss| {
-        ["r1", "r2"].iter().for_each(|router| bed.hub.link("s2", router, delay_ms, loss))
-    };
-    bed.fault("300 ms and 5 % loss at s2", &of[1], |bed| slow(bed, 300, 0.05), |bed| slow(bed, 0, 0.0));
-    bed.fault("r1 restarts", &[], |bed| drop(bed.processes.remove("r1")), |bed| bed.start_router(0));
-    let moved = of[2].clone();
-    bed.fault(
-        "s3 restarts at another address",
-        &of[2],
-        |bed| drop(bed.processes.remove("s3")),
-        |bed| {
-            let status =
-                Command::new("ip").args(["-n", "s3", "address", "delete", "10.99.0.13/24", "dev", "wire"]).status();
-            assert!(status.expect("ip runs").success());
-            bed.start_server("s3", &moved);
-        },
-    );
-    let claimed = [CLAIMED.to_owned()];
-    bed.fault(
-        "another server claims v00",
-        &[],
-        |bed| {
-            bed.start_server("p2", &claimed);
-            bed.start("p2 feed", "p2", &["feed", CLAIMED]);
-        },
-        |bed| ["p2 feed", "p2"].into_iter().for_each(|name| drop(bed.processes.remove(name))),
-    );
+fn faults() -> Vec<Fault> {
+    let fault = |name, title, concerns, make, repair| Fault { name, title, concerns, make, repair };
+    let no_stream: Concerns = |_, _, _| false;
+    let of_p1: Concerns = |_, planner, _| planner == "p1";
+    let of: [Concerns; 3] = [
+        |bed, _, vehicle| bed.vehicles[0].iter().any(|name| name == vehicle),
+        |bed, _, vehicle| bed.vehicles[1].iter().any(|name| name == vehicle),
+        |bed, _, vehicle| bed.vehicles[2].iter().any(|name| name == vehicle),
+    ];
+    vec![
+        fault("none", "none", no_stream, |_| {}, |_| {}),
+        fault("cut", "the links of s1 are cut", of[0], |bed| bed.links("s1", 0, 1.0), |bed| bed.links("s1", 0, 0.0)),
+        fault(
+            "cut-one",
+            "the link of s1 to r1 is cut",
+            of[0],
+            |bed| bed.hub.link("s1", "r1", 0, 1.0),
+            |bed| bed.hub.link("s1", "r1", 0, 0.0),
+        ),
+        fault(
+            "cut-planner",
+            "the links of p2 are cut",
+            |_, planner, _| planner == "p2",
+            |bed| bed.links("p2", 0, 1.0),
+            |bed| bed.links("p2", 0, 0.0),
+        ),
+        fault(
+            "cut-routers",
+            "the link between the routers is cut",
+            no_stream,
+            |bed| bed.hub.link("r1", "r2", 0, 1.0),
+            |bed| bed.hub.link("r1", "r2", 0, 0.0),
+        ),
+        fault(
+            "slow",
+            "300 ms and 5 % loss at s2",
+            of[1],
+            |bed| bed.links("s2", 300, 0.05),
+            |bed| bed.links("s2", 0, 0.0),
+        ),
+        fault("router", "r1 restarts", no_stream, |bed| bed.stop(&["r1"]), |bed| bed.start_router(0)),
+        fault(
+            "moved",
+            "s3 restarts at another address",
+            of[2],
+            |bed| bed.stop(&["s3 server"]),
+            |bed| {
+                let arguments = ["-n", "s3", "address", "delete", "10.99.0.13/24", "dev", "wire"];
+                assert!(Command::new("ip").args(arguments).status().expect("ip runs").success());
+                bed.start_server("s3", "", &bed.vehicles[2].clone());
+            },
+        ),
+        fault(
+            "claimed",
+            "another server claims v00",
+            no_stream,
+            |bed| {
+                bed.start_server("p2", "", &[CLAIMED.to_owned()]);
+                bed.start("p2 feed", "p2", "", &["feed", CLAIMED]);
+            },
+            |bed| bed.stop(&["p2 feed", "p2 server"]),
+        ),
+        fault(
+            "server-behind",
+            "the clock of s2 is 2 s behind",
+            of[1],
+            |bed| bed.start_vehicles(1, "-2s"),
+            |bed| bed.start_vehicles(1, ""),
+        ),
+        fault(
+            "server-ahead",
+            "the clock of s2 is 2 s ahead",
+            of[1],
+            |bed| bed.start_vehicles(1, "+2s"),
+            |bed| bed.start_vehicles(1, ""),
+        ),
+        fault(
+            "planner-behind",
+            "the clock of p1 is 2 s behind",
+            of_p1,
+            |bed| bed.start_planner(0, "-2s"),
+            |bed| bed.start_planner(0, ""),
+        ),
+        fault(
+            "planner-ahead",
+            "the clock of p1 is 2 s ahead",
+            of_p1,
+            |bed| bed.start_planner(0, "+2s"),
+            |bed| bed.start_planner(0, ""),
+        ),
+    ]
 }

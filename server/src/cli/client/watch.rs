@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use clearway_client::{ClientError, MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{ClientError, MapStream, PassedOver, Staleness, StreamEvent, Subscription, Update, now_ns};
 use console::truncate_str;
 use serde_json::json;
 
@@ -190,6 +190,7 @@ fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
     if as_json {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
+            "stale_because": map.staleness(now).map(|why| why.to_string()),
             "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
             "lost": update.lost, "left_out": update.left_out, "passed_over": passed_over.hostile(),
             "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
@@ -197,7 +198,7 @@ fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
         return document.to_string();
     }
     let share = share.map_or("    -".into(), |share| format!("{:5.1}", 100.0 * share));
-    let stale = if map.is_stale(now) { "  STALE" } else { "" };
+    let stale = map.staleness(now).map_or(String::new(), |why| format!("  STALE: {why}"));
     let passed_over = match passed_over.hostile() {
         0 => String::new(),
         messages => format!("  passed over {messages} messages that are no maps of this server"),
@@ -216,10 +217,11 @@ fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Option
     match newest {
         Some(update) if options.json => line(update, passed_over, true),
         Some(Update { map, .. }) => format!(
-            "{} #{:06}  age {:7.1} ms  STALE: no newer map has arrived; waiting",
+            "{} #{:06}  age {:7.1} ms  STALE: {}; waiting",
             map.vehicle(),
             map.sequence(),
-            map.age_ms(now_ns())
+            map.age_ms(now_ns()),
+            map.staleness(now_ns()).unwrap_or(Staleness::NoNewer)
         ),
         None if options.json => {
             json!({"vehicle": options.vehicle, "sequence": null, "age_ms": null, "stale": true}).to_string()

@@ -1,0 +1,308 @@
+//! The processes of a simulated fleet, as `machines` and `growth` start them: routers, servers, senders and readers.
+//!
+//! A server is the program `clearway`; every other process is the binary of the run itself with one of the [`Role`]s.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use clap::Subcommand;
+use clearway::config::{Config, Vehicle, ZenohMode};
+use clearway_client::{Client, MapStream, Observation, Staleness, StreamEvent, ZenohClient, now_ns};
+use clearway_lidar::model::Model;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::town;
+use clearway_sim::vehicle::SimulatedVehicle;
+
+use crate::packets::{packets, send};
+
+/// The environment of a router, as in `deploy/`: a thread that closes the connection of a peer behind a cut link is
+/// blocked for up to 10 s, because zenoh lets the socket linger. With zenoh's two threads that receive, two such peers
+/// stop a router.
+pub const ROUTER_ENVIRONMENT: (&str, &str) = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))");
+
+/// Layers that a planner reads.
+pub const LAYERS: [&str; 2] = ["drivability", "speed"];
+/// Age of a map that arrives late, in ms: the default validity.
+const LATE_MS: f64 = 300.0;
+/// Time between two lines of [`Role::Planners`].
+const REPORT_PERIOD: Duration = Duration::from_millis(200);
+/// Planners that connect at once.
+const CONNECTING_MAX: usize = 8;
+
+/// What a process of the run does.
+///
+/// Lists are separated by commas.
+#[derive(Subcommand)]
+pub enum Role {
+    /// Sends scans to the gRPC server of this machine.
+    Feed {
+        /// Names of the vehicles.
+        vehicles: String,
+    },
+    /// Prints when a stream becomes stale, and why, or fresh, or changes its server.
+    Read {
+        /// Endpoints of routers; the first that answers is used.
+        endpoints: String,
+        /// Names of the vehicles.
+        vehicles: String,
+    },
+    /// A router.
+    Router {
+        /// The endpoint on which it listens.
+        listen: String,
+        /// Endpoints of the routers to which it connects.
+        others: String,
+    },
+    /// Planners, each with a session of its own, that read [`LAYERS`]; prints what has come.
+    Planners {
+        /// Endpoint of the router.
+        endpoint: String,
+        /// The name of each planner's vehicle.
+        vehicles: String,
+    },
+    /// Sends the packets of a simulated sensor.
+    Sensors {
+        /// The model, such as `vlp16`.
+        model: String,
+        /// Length of the drive.
+        seconds: u64,
+        /// The UDP address of each vehicle.
+        to: String,
+    },
+}
+
+impl Role {
+    /// Runs the role. It ends with the process, but for [`Role::Sensors`].
+    ///
+    /// # Panics
+    /// If the process cannot do what the role says.
+    pub fn run(&self) {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().expect("a runtime");
+        match self {
+            Self::Feed { vehicles } => runtime.block_on(feed(vehicles)),
+            Self::Read { endpoints, vehicles } => runtime.block_on(read(endpoints, vehicles)),
+            Self::Router { listen, others } => runtime.block_on(route(listen, others)),
+            Self::Planners { endpoint, vehicles } => runtime.block_on(plan(endpoint, vehicles)),
+            Self::Sensors { model, seconds, to } => sense(model, Duration::from_secs(*seconds), to),
+        }
+    }
+}
+
+/// A process of the run; it is killed when this is dropped.
+pub struct Process(pub Child);
+
+impl Process {
+    /// Starts a command whose standard output is read and whose errors are not.
+    ///
+    /// # Panics
+    /// If it cannot be started.
+    pub fn start(command: &mut Command) -> Self {
+        let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+        Self(command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}")))
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ended = self.0.kill();
+        let _reaped = self.0.wait();
+    }
+}
+
+/// The server's program: `clearway` beside this one, unless another is named.
+///
+/// # Panics
+/// If the path of this program is not known.
+pub fn server_binary(named: Option<&PathBuf>) -> PathBuf {
+    named
+        .cloned()
+        .unwrap_or_else(|| std::env::current_exe().expect("the path of this binary").with_file_name("clearway"))
+}
+
+/// The name of the vehicle with this number.
+pub fn name(number: usize) -> String {
+    format!("v{number:02}")
+}
+
+/// The configuration of a server with these vehicles, each with one sensor `top` and without UDP, behind these routers.
+pub fn server_config(vehicles: &[String], routers: &[String]) -> Config {
+    let mut config = Config::of_one_vehicle("car", "top");
+    let vehicle = Vehicle { udp: None, ..config.vehicles.remove(0) };
+    config.vehicles = vehicles.iter().map(|name| Vehicle { name: name.clone(), ..vehicle.clone() }).collect();
+    config.page.enabled = false;
+    config.zenoh.mode = ZenohMode::Client;
+    (config.zenoh.listen, config.zenoh.connect) = (Vec::new(), routers.to_vec());
+    config
+}
+
+/// Ten scans a second of each vehicle: a plain, 1,440 points.
+async fn feed(vehicles: &str) {
+    let rays = || (0..1440_u32).map(|ray| (f64::from(ray).to_radians(), 3.0 + f64::from(ray / 360) * 4.0));
+    let list = |of: &dyn Fn(f64, f64) -> f64| rays().map(|(angle, range_m)| of(angle, range_m) as f32).collect();
+    let x: Vec<f32> = list(&|angle, range_m| angle.cos() * range_m);
+    let y: Vec<f32> = list(&|angle, range_m| angle.sin() * range_m);
+    let z: Vec<f32> = list(&|_, _| -2.0);
+    let feeds = vehicles.split(',').map(|vehicle| async {
+        let mut every = tokio::time::interval(Duration::from_millis(100));
+        loop {
+            every.tick().await;
+            let Ok(client) = Client::connect("127.0.0.1:50051").await else { continue };
+            let Ok(mut ingester) = client.ingest(vehicle).await else { continue };
+            while ingester.send(Observation::scan("top", now_ns(), &x, &y, &z)).await.is_ok() {
+                every.tick().await;
+            }
+        }
+    });
+    futures::future::join_all(feeds).await;
+}
+
+/// Connects as often as necessary.
+async fn connect(endpoints: &str) -> ZenohClient {
+    loop {
+        match ZenohClient::connect(endpoints).await {
+            Ok(client) => return client,
+            Err(_) => tokio::time::sleep(Duration::from_millis(100)).await,
+        }
+    }
+}
+
+/// Follows every vehicle.
+async fn read(endpoints: &str, vehicles: &str) {
+    let client = connect(endpoints).await;
+    let streams = vehicles.split(',').map(|vehicle| {
+        let client = client.clone();
+        async move {
+            let (mut said, mut run) = ("", 0);
+            let mut maps = client.subscribe(vehicle, "drivability").await.expect("a subscription");
+            while let Ok(event) = maps.next_or_stale().await {
+                let (StreamEvent::Fresh(update) | StreamEvent::Stale(update)) = event;
+                let boot_id = update.map.header().boot_id;
+                if boot_id != run {
+                    println!("{vehicle} run {boot_id}");
+                    run = boot_id;
+                }
+                let why = match update.map.staleness(update.map.now_ns()) {
+                    None => "fresh",
+                    Some(Staleness::NoNewer) => "stale no-newer",
+                    Some(Staleness::OnArrival { .. }) => "stale old-on-arrival",
+                    Some(Staleness::InTheFuture { .. }) => "stale in-the-future",
+                };
+                if why != said {
+                    println!("{vehicle} {why}");
+                    said = why;
+                }
+            }
+        }
+    });
+    futures::future::join_all(streams).await;
+}
+
+/// The router of `deploy/`, in plain text and without access control.
+async fn route(listen: &str, others: &str) {
+    let file = crate::workspace().join("deploy/zenoh/router.json5");
+    let text = std::fs::read_to_string(file).expect("a file of the repository");
+    let mut config = zenoh::Config::from_json5(&text.replace("tls/0.0.0.0:7447", listen)).expect("a configuration");
+    config.insert_json5("access_control/enabled", "false").expect("a setting of zenoh");
+    let others: Vec<_> = others.split(',').filter(|other| !other.is_empty()).collect();
+    config.insert_json5("connect/endpoints", &format!("{others:?}")).expect("a setting of zenoh");
+    let _router = zenoh::open(config).await.expect("the port is free");
+    std::future::pending::<()>().await;
+}
+
+/// What planners have received.
+#[derive(Default)]
+struct Received {
+    maps: AtomicU64,
+    bytes: AtomicU64,
+    /// Maps that the links lost.
+    lost: AtomicU64,
+    /// Maps that came older than [`LATE_MS`].
+    late: AtomicU64,
+    connected: AtomicU64,
+}
+
+/// A session and a stream of each layer for each vehicle. Lines: milliseconds since the start, planners with a session,
+/// maps, bytes, lost maps, late maps; all since the start.
+async fn plan(endpoint: &str, vehicles: &str) {
+    let (received, began) = (Arc::<Received>::default(), Instant::now());
+    let turns = Arc::new(tokio::sync::Semaphore::new(CONNECTING_MAX));
+    for vehicle in vehicles.split(',').filter(|name| !name.is_empty()).map(str::to_owned) {
+        let (received, turns, endpoint) = (received.clone(), turns.clone(), endpoint.to_owned());
+        tokio::spawn(async move {
+            let turn = turns.acquire().await.expect("it is not closed");
+            let client = connect(&endpoint).await;
+            let mut streams = Vec::new();
+            for layer in LAYERS {
+                streams.push(client.subscribe(&vehicle, layer).await.expect("a subscription"));
+            }
+            drop(turn);
+            received.connected.fetch_add(1, Ordering::Relaxed);
+            futures::future::join_all(streams.into_iter().map(|maps| count(maps, &received))).await;
+        });
+    }
+    let mut every = tokio::time::interval(REPORT_PERIOD);
+    loop {
+        every.tick().await;
+        let Received { maps, bytes, lost, late, connected } = &*received;
+        let counts = [connected, maps, bytes, lost, late].map(|count| count.load(Ordering::Relaxed));
+        let [connected, maps, bytes, lost, late] = counts;
+        println!("{} {connected} {maps} {bytes} {lost} {late}", began.elapsed().as_millis());
+    }
+}
+
+/// Counts the maps of a stream until it ends.
+async fn count(mut maps: MapStream, received: &Received) {
+    while let Ok(update) = maps.next().await {
+        // Maps between this one and the last were received too, but for the lost ones; their sizes differ little.
+        let maps = 1 + update.skipped - update.lost;
+        received.maps.fetch_add(maps, Ordering::Relaxed);
+        received.bytes.fetch_add(maps * update.map.bytes().len() as u64, Ordering::Relaxed);
+        received.lost.fetch_add(update.lost, Ordering::Relaxed);
+        received.late.fetch_add(u64::from(update.map.age_ms(now_ns()) > LATE_MS), Ordering::Relaxed);
+    }
+}
+
+/// Simulates the drive beforehand, so that only sending takes time while it is measured.
+fn sense(model: &str, length: Duration, to: &str) {
+    let config = ScannerConfig { model: model.parse::<Model>().expect("a model"), ..ScannerConfig::default() };
+    let second = Duration::from_secs(1);
+    let began = Instant::now();
+    packets(SimulatedVehicle::new(town(), config.clone()), second);
+    // The drive's stamps are those of the moment at which it will be sent.
+    let lead = second + began.elapsed().mul_f64(1.5 * length.as_secs_f64());
+    let (start, start_ns) = (Instant::now() + lead, now_ns() + lead.as_nanos() as i64);
+    let drive = packets(SimulatedVehicle::starting_at(town(), config, start_ns), length);
+    let to: Vec<(usize, SocketAddr)> = to.split(',').map(|at| at.parse().expect("an address")).enumerate().collect();
+    send(&drive, &to, to.len(), start, &AtomicU64::default());
+}
+
+/// The last line that a process has printed, empty before the first.
+pub fn last_line(process: &mut Process) -> Arc<Mutex<String>> {
+    let (output, last) = (process.0.stdout.take().expect("piped"), Arc::<Mutex<String>>::default());
+    std::thread::spawn({
+        let last = last.clone();
+        move || {
+            let lines = std::io::BufRead::lines(std::io::BufReader::new(output));
+            lines.map_while(Result::ok).for_each(|line| *last.lock().expect("no panic") = line);
+        }
+    });
+    last
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_routers_of_deploy_have_the_environment_of_those_that_are_measured() {
+        for file in ["container/compose.yaml", "kubernetes/router.yaml", "README.md"] {
+            let text = std::fs::read_to_string(crate::workspace().join("deploy").join(file)).expect("it is there");
+            assert!(text.contains(ROUTER_ENVIRONMENT.0) && text.contains(ROUTER_ENVIRONMENT.1), "{file}");
+        }
+    }
+}
