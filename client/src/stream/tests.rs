@@ -189,7 +189,7 @@ async fn a_step_of_the_wall_clock_makes_no_stale_map_fresh() {
 
 #[tokio::test]
 async fn a_stale_map_says_whether_the_clocks_differ_or_no_newer_map_came() {
-    let mut bed = TestBed::new();
+    let bed = TestBed::new();
     for (sequence, (age_ms, expected)) in (0..).zip([
         (40, None),
         (-40, None),
