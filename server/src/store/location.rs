@@ -26,7 +26,7 @@ pub struct OpenError {
     pub reason: String,
 }
 
-/// Opens a store to write: a folder by its path or as `file:///PATH`, which is created in an existing folder, or
+/// Opens a store to write: a folder by its path or as `file:///PATH`, which is created if it does not exist, or
 /// `s3://BUCKET/PREFIX`. The environment variables `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and
 /// `AWS_ENDPOINT_URL` (of a compatible server, also by `http`) are those of the AWS tools.
 ///
@@ -36,11 +36,7 @@ pub struct OpenError {
 pub fn open(url: &str) -> Result<Arc<dyn ObjectStore>, OpenError> {
     if let Some(folder) = folder(url) {
         let wrong = |source| OpenError { url: url.to_owned(), reason: advised(folder, source).to_string() };
-        // Not the folders above it: a disk that is not mounted would become a folder of the disk below it.
-        match std::fs::create_dir(folder) {
-            Err(error) if !folder.is_dir() => return Err(wrong(error)),
-            _ => {}
-        }
+        std::fs::create_dir_all(folder).map_err(wrong)?;
     }
     open_existing(url)
 }
