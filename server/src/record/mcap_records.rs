@@ -303,7 +303,7 @@ impl McapRecords {
         Ok(())
     }
 
-    /// Consumes an index: of the newest chunk, or of a chunk that is lost, which a record of a private kind before it was.
+    /// Consumes an index: of the newest chunk, or of a lost one, which a record of a private kind before it was.
     fn read_index(&mut self, index: &MessageIndex, end: usize, private: Option<(u64, u64)>) {
         let body = &self.buffer[self.start + RECORD_HEAD_BYTES..self.start + end];
         let Some(right) = self.indexes.add(index, body, &self.chunk.0) else { return self.consume(end) };
