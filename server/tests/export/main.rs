@@ -244,7 +244,7 @@ fn a_file_of_an_unknown_kind_is_refused() {
     let path = file.to_str().unwrap();
     let info = clearway(&["info", path]);
     assert_eq!(info.status.code(), Some(2));
-    assert!(text(&info.stderr).contains("not a capture"), "{}", text(&info.stderr));
+    assert!(text(&info.stderr).contains("not pcap, pcapng, MCAP"), "{}", text(&info.stderr));
     let exported = clearway(&["export", path, "--layer", "x", "--format", "png", "--out", path]);
     assert_eq!(exported.status.code(), Some(2));
     assert!(text(&exported.stderr).contains("not an MCAP file"), "{}", text(&exported.stderr));
