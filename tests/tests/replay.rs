@@ -210,8 +210,7 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
     std::fs::write(at("old.mcap"), "old").unwrap();
     std::os::unix::fs::symlink("old.mcap", at("other.mcap")).unwrap();
     std::fs::write(at("later.part-0002.mcap"), "old").unwrap();
-    let busy = std::fs::File::create(at("busy.unfinished.mcap")).unwrap();
-    busy.lock().unwrap();
+    std::fs::write(at("busy.unfinished.mcap"), "all that a crash has left").unwrap();
     for (output, force, expected) in [
         ("a.mcap", false, "this file is replayed"),
         ("a.mcap", true, "this file is replayed"),
@@ -222,7 +221,8 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
         ("folder/", true, "name a file"),
         ("other.mcap", true, "this is a symbolic link; name the file that it leads to"),
         ("later.mcap", true, "later.part-0002.mcap is a part of an earlier recording of this name"),
-        ("busy.mcap", true, "another process is writing"),
+        ("busy.mcap", true, "busy.unfinished.mcap is the name of a recording that is being written or that a crash"),
+        ("busy.unfinished.mcap", true, "busy.unfinished.mcap is the name of a recording"),
     ] {
         let force = if force { &["--force"][..] } else { &[] };
         let (success, error) = replay(&[&["a.mcap", "--record", output][..], force].concat());
@@ -230,7 +230,15 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
         assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "{output}: the input is unchanged");
     }
     assert_eq!(std::fs::read(at("old.mcap")).unwrap(), b"old");
+    let left = std::fs::read(at("busy.unfinished.mcap")).unwrap();
+    assert_eq!(left, b"all that a crash has left");
     std::fs::remove_file(at("busy.unfinished.mcap")).unwrap();
+    // A capture that ends within a packet is replayed, and replaces no recording.
+    let capture = std::fs::read(at("drive.pcap")).unwrap();
+    std::fs::write(at("cut.pcap"), &capture[..capture.len() / 2]).unwrap();
+    let (success, error) = replay(&["cut.pcap", "--record", "old.mcap", "--force"]);
+    assert!(!success && at("old.early.mcap").exists(), "{error}");
+    assert_eq!(std::fs::read(at("old.mcap")).unwrap(), b"old");
     let (success, error) = replay(&["a.mcap", "--record", "old.mcap", "--force"]);
     assert!(success, "{error}");
     assert!(verify(&at("old.mcap")).unwrap().is_good());

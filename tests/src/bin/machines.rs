@@ -402,33 +402,24 @@ fn faults() -> Vec<Fault> {
             },
             |bed| bed.stop(&["p2 feed", "p2 server"]),
         ),
-        fault(
-            "server-behind",
-            "the clock of s2 is 2 s behind",
-            of[1],
-            |bed| bed.start_vehicles(1, "-2s"),
-            |bed| bed.start_vehicles(1, ""),
-        ),
-        fault(
-            "server-ahead",
-            "the clock of s2 is 2 s ahead",
-            of[1],
-            |bed| bed.start_vehicles(1, "+2s"),
-            |bed| bed.start_vehicles(1, ""),
-        ),
-        fault(
-            "planner-behind",
-            "the clock of p1 is 2 s behind",
-            of_p1,
-            |bed| bed.start_planner(0, "-2s"),
-            |bed| bed.start_planner(0, ""),
-        ),
-        fault(
-            "planner-ahead",
-            "the clock of p1 is 2 s ahead",
-            of_p1,
-            |bed| bed.start_planner(0, "+2s"),
-            |bed| bed.start_planner(0, ""),
-        ),
+        fault("server-behind", "the clock of s2 is 2 s behind", of[1], clock_of_s2::<-2>, clock_of_s2::<0>),
+        fault("server-ahead", "the clock of s2 is 2 s ahead", of[1], clock_of_s2::<2>, clock_of_s2::<0>),
+        fault("planner-behind", "the clock of p1 is 2 s behind", of_p1, clock_of_p1::<-2>, clock_of_p1::<0>),
+        fault("planner-ahead", "the clock of p1 is 2 s ahead", of_p1, clock_of_p1::<2>, clock_of_p1::<0>),
     ]
+}
+
+/// Starts the server of s2 and its feed again, with a clock that is so many seconds ahead.
+fn clock_of_s2<const AHEAD_S: i32>(bed: &mut Bed) {
+    bed.start_vehicles(1, &clock(AHEAD_S));
+}
+
+/// Starts the reader of p1 again, with a clock that is so many seconds ahead.
+fn clock_of_p1<const AHEAD_S: i32>(bed: &mut Bed) {
+    bed.start_planner(0, &clock(AHEAD_S));
+}
+
+/// The clock as libfaketime takes it; empty for the machine's own.
+fn clock(ahead_s: i32) -> String {
+    if ahead_s == 0 { String::new() } else { format!("{ahead_s:+}s") }
 }

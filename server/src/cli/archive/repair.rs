@@ -47,7 +47,7 @@ pub fn run(options: &Options) -> Result<Exit> {
             print_line(&format!("{}: {damage}", if damage.is_loss { "lost" } else { "damaged, and nothing is lost" }))?;
         }
         if let Some(incomplete) = &report.incomplete {
-            print_line(&format!("{} is {incomplete}", options.input.display()))?;
+            print_line(&format!("{} is not whole: {incomplete}", options.input.display()))?;
         }
         if report.lacks_config {
             let new = options.output.display();

@@ -226,17 +226,7 @@ impl Files for Folder {
         if !self.replaces && self.finished(part).exists() {
             return Err(ErrorKind::AlreadyExists.into());
         }
-        let file = match File::create_new(&path) {
-            Err(error) if error.kind() == ErrorKind::AlreadyExists && self.replaces => {
-                if is_being_written(&path) {
-                    let written = format!("another process is writing {}; name another file", path.display());
-                    return Err(io::Error::new(ErrorKind::ResourceBusy, written));
-                }
-                fs::remove_file(&path)?;
-                File::create_new(&path)
-            }
-            file => file,
-        }?;
+        let file = File::create_new(&path)?;
         // Waits only for a look of [`is_being_written`].
         if let Err(error) = file.lock() {
             tracing::warn!(file = %path.display(), %error, "other programs cannot see that this file is being written");
@@ -373,6 +363,11 @@ fn with_infix(file: &Path, infix: &str) -> PathBuf {
 /// True if a recording to `file` would meet a file of an earlier one: its first part or, if that was deleted, another.
 fn is_taken(file: &Path) -> bool {
     file.symlink_metadata().is_ok() || with_infix(file, "unfinished").exists() || later_part_of(file).is_some()
+}
+
+/// The name of the first part of the recording `file` while it is written.
+pub fn unfinished_name(file: &Path) -> PathBuf {
+    with_infix(file, "unfinished")
 }
 
 /// A part of the recording `file` other than the first.

@@ -46,7 +46,7 @@ pub fn reason(outcome: &Outcome) -> String {
                     format!("; repaired: what was lost in {places} is no difference, the first: {first}")
                 }
             };
-            let incomplete = report.incomplete.iter().map(|how| format!("; the file is {how}"));
+            let incomplete = report.incomplete.iter().map(|how| format!("; the file is not whole: {how}"));
             result + &unjudged + &dropped + &repaired + &incomplete.collect::<String>()
         }
         Outcome::Compared(comparison) => {

@@ -261,14 +261,16 @@ pub async fn replay(
     };
     let ended = running.shutdown().await;
     let outcome = outcome.map_err(|_| ReplayError::Engine).and_then(|played| Ok(played?));
-    let is_whole = ready_file.is_ok() && ended.is_ok() && outcome.as_ref().is_ok_and(|played| played.reached_end);
+    let received: u64 = running_vehicles.0.iter().map(|served| served.status.snapshot().ledger.received).sum();
+    let is_read = |played: &Played| played.reached_end && played.remarks.truncated.is_empty() && received > 0;
+    let is_whole = ready_file.is_ok() && ended.is_ok() && outcome.as_ref().is_ok_and(is_read);
     let new = former.map_or(Ok(None), |former| former.end(is_whole));
     ready_file?;
     let played = outcome?;
     ended?;
     if let Some(new) = new? {
         summary.notes.push(format!(
-            "the replay ended early: the file of --record is still the former recording, the new one is {}",
+            "the replay is not whole: the file of --record is still the former recording, the new one is {}",
             new.display()
         ));
         summary.record = Some(new);
@@ -276,7 +278,7 @@ pub async fn replay(
     summary.reached_end = played.reached_end;
     summary.snapshot = status.snapshot();
     summary.truncated = played.remarks.truncated;
-    summary.notes = played.remarks.notes;
+    summary.notes.extend(played.remarks.notes);
     if played.behind_max > BEHIND_MAX {
         let seconds = played.behind_max.as_secs_f64();
         summary.notes.push(format!("this machine was too slow for this speed: maps were up to {seconds:.1} s late"));

@@ -38,8 +38,8 @@ pub struct Options {
     /// Record the events and the maps to this MCAP file, which must not exist.
     #[arg(long, value_name = "OUT.mcap")]
     pub record: Option<PathBuf>,
-    /// Replace the file of --record if it exists, when the new one is whole. If the replay ends before, the file keeps
-    /// its name, and the new one is named OUT.early.mcap.
+    /// Replace the file of --record if it exists, when the new one is whole. If the replay ends before, or a file is not
+    /// whole or has no reading, the file keeps its name, and the new one is named OUT.early.mcap.
     #[arg(long, requires = "record")]
     pub force: bool,
     /// Speed of the replay: as-recorded, max, or a factor such as 0.5 [default: max; as-recorded with --serve].
@@ -253,6 +253,18 @@ pub enum ReplayError {
     RecordLink {
         /// The link.
         file: PathBuf,
+    },
+    /// A recording that is not finished has that name, or a name that the new one needs.
+    #[error(
+        "--record {}: {} is the name of a recording that is being written or that a crash has left; name another file",
+        file.display(),
+        unfinished.display()
+    )]
+    RecordUnfinished {
+        /// The file.
+        file: PathBuf,
+        /// The unfinished recording.
+        unfinished: PathBuf,
     },
     /// The recording would become the first part of an earlier one.
     #[error("--record {}: {} is a part of an earlier recording of this name; name another file", file.display(), part.display())]

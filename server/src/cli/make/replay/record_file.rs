@@ -5,7 +5,7 @@ use std::io::Error;
 use std::path::{Path, PathBuf};
 
 use super::options::{Options, ReplayError};
-use crate::record::writer::{is_same_file, later_part_of, next_free_name};
+use crate::record::writer::{is_same_file, later_part_of, next_free_name, unfinished_name};
 
 /// Refuses a file of `--record` that is replayed, is no file, or may not be replaced.
 ///
@@ -38,6 +38,14 @@ pub(super) fn check_record(options: &Options, record: &Path) -> Result<(), Repla
     }
     if exists.is_ok_and(|of| of.is_symlink()) {
         return Err(ReplayError::RecordLink { file: record.to_owned() });
+    }
+    // After a crash it is all that is left of a recording.
+    let unfinished = unfinished_name(record);
+    if unfinished.symlink_metadata().is_ok() {
+        return Err(ReplayError::RecordUnfinished { file: record.to_owned(), unfinished });
+    }
+    if record.to_string_lossy().ends_with(".unfinished.mcap") {
+        return Err(ReplayError::RecordUnfinished { file: record.to_owned(), unfinished: record.to_owned() });
     }
     if let Some(part) = later_part_of(record) {
         return Err(ReplayError::RecordParts { file: record.to_owned(), part });
