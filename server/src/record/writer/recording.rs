@@ -467,6 +467,7 @@ impl<F: Files> RecordingWriter<F> {
         let Part { mut file, unsynced, is_needed, .. } = part;
         let closed = file.write_counts(&counts).and_then(|()| file.finish());
         if closed.is_ok() && !is_needed && self.files.discard(number).is_ok() {
+            self.files.delete_old();
             return;
         }
         let closed = closed.and_then(|()| self.files.complete(number).map_err(McapError::Io));
