@@ -294,7 +294,14 @@ fn hash(message: &Message) -> u32 {
 /// # Errors
 /// If the recording is not whole.
 pub fn rechunk(bytes: &[u8], chunk_bytes: u64) -> mcap::McapResult<Vec<u8>> {
-    let options = mcap::WriteOptions::new().chunk_size(Some(chunk_bytes)).compression_threads(0);
+    rewritten(bytes, mcap::WriteOptions::new().chunk_size(Some(chunk_bytes)).compression_threads(0))
+}
+
+/// The same recording, written with these options.
+///
+/// # Errors
+/// If the recording is not whole.
+pub fn rewritten(bytes: &[u8], options: mcap::WriteOptions) -> mcap::McapResult<Vec<u8>> {
     let mut writer = options.create(Cursor::new(Vec::new()))?;
     for record in mcap::read::LinearReader::new(bytes)? {
         match record? {

@@ -13,7 +13,7 @@ use std::path::Path;
 use clearway::config::Config;
 use clearway::ingest::queue::Reading;
 use clearway::record::reader::{RecordingError, RecordingReader};
-use clearway::record::verify::{DifferenceKind, verify};
+use clearway::record::verify::{DifferenceKind, Disorder, verify};
 use clearway::server::{Server, Setup};
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
@@ -143,7 +143,10 @@ async fn verify_names_a_missing_map_a_changed_header_and_a_journal_gap() {
 
     copy(&whole, &changed_copy, |topic, sequence, data| (topic != "/car/journal" || sequence != 40).then_some(data));
     let report = verify(&changed_copy).unwrap();
-    assert_eq!((report.differences[0].sequence, &report.differences[0].kind), (40, &DifferenceKind::Gap { found: 41 }));
+    let gap = Disorder::Event { vehicle: "car".into(), expected: 40, found: 41 };
+    assert_eq!((report.different, report.disorder), (0, vec![gap]));
+    let named = "in 1 place, the first: vehicle car: event 41 stands in the place of event 40";
+    assert!(report.incomplete.as_ref().is_some_and(|how| how.ends_with(named)), "{:?}", report.incomplete);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -230,6 +230,17 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
         assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "{output}: the input is unchanged");
     }
     assert_eq!(std::fs::read(at("old.mcap")).unwrap(), b"old");
+    let wide = "[[vehicle]]\nname = \"car\"\n[[vehicle.sensor]]\nname = \"top\"\n";
+    std::fs::write(at("car.toml"), wide).unwrap();
+    std::fs::write(at("stop.txt"), "stop@0-0.1").unwrap();
+    for [option, file] in [["--config", "car.toml"], ["--fault-script", "stop.txt"], ["--ready-file", "new.json"]] {
+        let serve = if option == "--ready-file" { &["--serve", "--any-port", "--exit-at-end"][..] } else { &[] };
+        let (success, error) =
+            replay(&[&["drive.pcap", option, file, "--force", "--record", file][..], serve].concat());
+        let expected = format!("--record {file}: this is the file of {option}; name another file");
+        assert!(!success && error.contains(&expected), "{error}");
+    }
+    assert_eq!(std::fs::read_to_string(at("car.toml")).unwrap(), wide);
     let left = std::fs::read(at("busy.unfinished.mcap")).unwrap();
     assert_eq!(left, b"all that a crash has left");
     std::fs::remove_file(at("busy.unfinished.mcap")).unwrap();
@@ -239,6 +250,21 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
     let (success, error) = replay(&["cut.pcap", "--record", "old.mcap", "--force"]);
     assert!(!success && at("old.early.mcap").exists(), "{error}");
     assert_eq!(std::fs::read(at("old.mcap")).unwrap(), b"old");
+    // So is one with bytes that are no packet, up to these.
+    let middle = capture.len() / 2;
+    std::fs::write(at("junk.pcap"), [&capture[..middle], &[0xee; 500], &capture[middle..]].concat()).unwrap();
+    let junk = clearway_tests::run(folder.path(), "clearway", &["replay", "junk.pcap", "--json"]);
+    let [said, error] = [junk.stdout, junk.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+    let summary: serde_json::Value = serde_json::from_str(&said).unwrap_or_else(|_| panic!("{said}{error}"));
+    assert!(junk.status.code() == Some(2) && summary["maps"].as_u64() > Some(0), "{said}");
+    assert!(error.contains("the capture is damaged at byte") && error.contains("the rest was used"), "{error}");
+    // The recorder of a replay is that of its options, and clouds are not overwritten.
+    let digests = ["a.mcap", "--record", "digests.mcap", "--set", "recorder.maps=digest", "--clouds", "clouds"];
+    let (success, error) = replay(&digests);
+    assert!(success, "{error}");
+    assert_eq!(verify(&at("digests.mcap")).unwrap().recorded, clearway::config::RecordedMaps::Digest);
+    let (success, error) = replay(&["a.mcap", "--clouds", "clouds"]);
+    assert!(!success && error.contains("none is overwritten; name another folder"), "{error}");
     let (success, error) = replay(&["a.mcap", "--record", "old.mcap", "--force"]);
     assert!(success, "{error}");
     assert!(verify(&at("old.mcap")).unwrap().is_good());

@@ -31,11 +31,15 @@ impl LostPart {
         Self { bytes, reason, is_loss, chunk_ns: None, index_ns: None, messages: BTreeMap::new() }
     }
 
-    /// Adds the messages of an index. A time outside of the chunk's is damage of the index.
-    pub(super) fn add_index(&mut self, index: &MessageIndex) {
-        *self.messages.entry(index.channel_id).or_default() += index.records.len() as u64;
+    /// Adds the messages of an index, from this position of the chunk's content on. A time outside of the chunk's is
+    /// damage of the index.
+    pub(super) fn add_index(&mut self, index: &MessageIndex, from: u64) {
+        let lost = || index.records.iter().filter(|entry| entry.offset >= from);
+        if lost().next().is_some() {
+            *self.messages.entry(index.channel_id).or_default() += lost().count() as u64;
+        }
         let (first, last) = self.chunk_ns.unwrap_or((0, u64::MAX));
-        for at in index.records.iter().map(|entry| entry.log_time).filter(|at| (first..=last).contains(at)) {
+        for at in lost().map(|entry| entry.log_time).filter(|at| (first..=last).contains(at)) {
             self.index_ns = Some(self.index_ns.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
         }
     }

@@ -24,6 +24,7 @@ use super::damage::Damage;
 use super::file_records::FileRecords;
 use super::mcap_records::{McapRecords, RecordsError};
 use super::mcap_summary;
+use super::record_counts::RecordCounts;
 
 /// Version of the contents of our recordings, in their metadata. A recording without one has version 1.
 pub const FORMAT: u32 = 1;
@@ -112,7 +113,7 @@ pub enum McapReadError {
         source: std::io::Error,
     },
     /// The file does not start as an MCAP file does.
-    #[error("{}: not an MCAP file: it does not start with the magic bytes; `clearway repair` reads a damaged one",
+    #[error("{}: not an MCAP file: it does not start with the magic bytes; if it was one, `clearway repair` reads the rest",
         file.display())]
     NotMcap {
         /// The file.
@@ -154,10 +155,7 @@ pub struct McapReader {
     first: Option<Message>,
     /// Number of messages of channels that no record describes.
     unknown: u64,
-    /// Number of messages by the file's own count, and by channel; dropped at the end if it cannot be trusted.
-    stated: Option<(u64, BTreeMap<u16, u64>)>,
-    /// Number of messages by channel.
-    read: BTreeMap<u16, u64>,
+    counts: RecordCounts,
     /// What a repair could not read, in file order.
     repaired: Vec<String>,
     /// True if the format in the metadata is damaged.
@@ -205,8 +203,7 @@ impl McapReader {
             waiting: VecDeque::new(),
             first: None,
             unknown: 0,
-            stated: None,
-            read: BTreeMap::new(),
+            counts: RecordCounts::default(),
             repaired: Vec::new(),
             has_wrong_format: false,
             has_ended: false,
@@ -293,19 +290,34 @@ impl McapReader {
         if self.has_ended && self.unknown > 0 {
             faults.push(format!("{} of channels that the file does not describe", counted(self.unknown, "message")));
         }
-        let Some((stated, by_channel)) = self.stated.as_ref().filter(|_| self.has_ended) else { return faults };
-        let read: u64 = self.read.values().sum();
-        if self.damage_count() == 0 && *stated != read {
-            faults.push(format!("has {}, and {stated} by its own count", counted(read, "message")));
+        faults.extend(self.faults_of_header());
+        let lost = self.records.lost().iter();
+        let named = (self.damage_count() > 0).then(|| lost.flat_map(|part| part.messages.values()).sum());
+        faults.extend(self.counts.fault(named, |id| self.topic(id)));
+        faults
+    }
+
+    /// What a recording of clearway lacks to be verified, if this is one. A repaired file says it where it was lost.
+    fn faults_of_header(&self) -> Vec<String> {
+        let has = |is: fn(&Content) -> bool| {
+            self.channels.iter().any(|(id, of)| is(&of.content) && self.counts.has_message_of(*id))
+        };
+        if !self.has_ended || !self.repaired.is_empty() || !has(|of| matches!(of, Content::Journal { .. })) {
+            return Vec::new();
         }
-        let read_of = |id| self.read.get(id).copied().unwrap_or_default();
-        let lost = by_channel.iter().map(|(id, stated)| (*id, stated.saturating_sub(read_of(id))));
-        let lost: BTreeMap<u16, u64> = lost.filter(|(_, lost)| *lost > 0).collect();
-        // Damage over several chunks may have destroyed an index that counts their messages.
-        let named: u64 = self.records.lost().iter().flat_map(|part| part.messages.values()).sum();
-        if self.damage_count() > 0 && named < lost.values().sum() {
-            let lost = lost.iter().map(|(id, lost)| format!("{} of {}", counted(*lost, "message"), self.topic(*id)));
-            faults.push(format!("lost in all, by its own count: {}", lost.collect::<Vec<_>>().join(", ")));
+        let mut faults = Vec::new();
+        let of = |key: &str| self.header.metadata.get(key).map(String::as_str);
+        if self.header.boot_id == 0 {
+            faults.push(format!("its metadata has the boot id {:?}, which is none", of("boot_id").unwrap_or_default()));
+        }
+        let has_maps = has(|of| matches!(of, Content::Map { .. } | Content::Digest { .. }));
+        if has_maps && of("maps") == Some("none") {
+            faults.push("its metadata says that no map is recorded, and maps are".into());
+        }
+        match self.header.config.as_ref().map(|text| text.parse::<toml::Table>()) {
+            None => faults.push("it has no config.toml, so its maps cannot be made again".into()),
+            Some(Err(error)) => faults.push(format!("its config.toml cannot be read: {}", error.message())),
+            Some(Ok(_)) => {}
         }
         faults
     }
@@ -317,14 +329,14 @@ impl McapReader {
         self.faults_of_end().len() > harmless
     }
 
-    /// Number of messages by the file's own count, if it can be trusted; `None` before the last message.
-    pub(super) fn stated_messages(&self) -> Option<u64> {
-        self.stated.as_ref().filter(|_| self.has_ended).map(|(messages, _)| *messages)
+    /// How many records the file has, and how many it should have.
+    pub(super) fn counts(&self) -> &RecordCounts {
+        &self.counts
     }
 
     /// Number of messages that the file lacks by its own count, if that can be trusted; 0 before the last message.
     pub fn missing_messages(&self) -> u64 {
-        self.stated_messages().map_or(0, |stated| stated.saturating_sub(self.read.values().sum()))
+        self.counts.missing_messages()
     }
 
     fn topic(&self, id: u16) -> String {
@@ -374,7 +386,7 @@ impl McapReader {
         };
         let Some(mut record) = record else {
             self.has_ended = true;
-            self.stated = self.stated.take().filter(|_| self.records.has_sound_counts());
+            self.counts.end(self.records.has_sound_counts());
             return Ok(None);
         };
         let is_unknown = |id: &u16| !self.channels.contains_key(id);
@@ -393,6 +405,7 @@ impl McapReader {
 
     /// Remembers what a record says about the messages and the file.
     fn remember(&mut self, record: &Record<'_>) -> Result<(), McapReadError> {
+        self.counts.add(record);
         match record {
             Record::Schema { header, .. } => {
                 self.check_version(&header.name)?;
@@ -404,7 +417,6 @@ impl McapReader {
                 self.channels.insert(of.id, Arc::new(Channel { topic: of.topic.clone(), schema, content }));
             }
             Record::Message { header, .. } => {
-                *self.read.entry(header.channel_id).or_default() += 1;
                 self.unknown += u64::from(!self.channels.contains_key(&header.channel_id));
             }
             Record::Metadata(metadata) if metadata.name == "clearway" => {
@@ -424,7 +436,6 @@ impl McapReader {
                     self.header.calibrations.insert(header.name.clone(), text);
                 }
             }
-            Record::Statistics(of) => self.stated = Some((of.message_count, of.channel_message_counts.clone())),
             _ => {}
         }
         Ok(())

@@ -14,10 +14,12 @@ use super::chunk::{
 };
 use super::chunk_indexes::ChunkIndexes;
 use super::damage::LostPart;
-use super::section_crc::{Finding, SectionCrc};
+use super::section_crc::{Finding, SectionCrc, wrong_crc};
 
 /// Bytes that a search reads at once.
 const SEARCH_BYTES: usize = 1 << 20;
+/// Why a file that is repaired does not start as MCAP files do.
+const NO_MAGIC: &str = "the file does not start with the magic bytes";
 /// Least kind of the records that programs define for themselves.
 const PRIVATE: u8 = 0x80;
 /// Names of the compressions, as chunks have them.
@@ -71,8 +73,9 @@ pub(super) struct McapRecords {
     /// True if a file that does not start as MCAP files do is searched for records.
     any_start: bool,
     has_chunks: bool,
-    /// True while message indexes belong to the newest lost part.
-    indexes_are_lost: bool,
+    /// Position in the content of the newest lost chunk from which its messages are lost, while message indexes belong
+    /// to it.
+    lost_from: Option<u64>,
     /// The bytes of the newest record, if it is of a private kind. Message indexes behind it say that it was a chunk.
     private: Option<(u64, u64)>,
     has_data_end: bool,
@@ -98,7 +101,7 @@ impl McapRecords {
             lost_before: 0,
             any_start,
             has_chunks: false,
-            indexes_are_lost: false,
+            lost_from: None,
             private: None,
             has_data_end: false,
             has_footer: false,
@@ -154,6 +157,7 @@ impl McapRecords {
     fn next_of_chunk(&mut self) -> Option<Record<'static>> {
         let (content, position) = &mut self.chunk;
         let mut rest = content.get(*position..).filter(|rest| !rest.is_empty())?;
+        let from = *position as u64;
         let record = split_record(&mut rest).map(Record::into_owned);
         *position = content.len() - rest.len();
         match record {
@@ -161,6 +165,7 @@ impl McapRecords {
             Err(error) => {
                 content.clear();
                 self.add_lost(self.chunk_bytes, &error);
+                self.lost_from = Some(from);
                 None
             }
         }
@@ -170,8 +175,11 @@ impl McapRecords {
         self.section = Section::Data;
         if self.fill(MAGIC.len())? && self.bytes().starts_with(MAGIC) {
             self.consume(MAGIC.len());
+        } else if self.any_start && self.fill(MAGIC.len() + RECORD_HEAD_BYTES)? && self.is_header_at(MAGIC.len())? {
+            self.consume(MAGIC.len());
+            self.lost.push(LostPart::new((0, self.offset), NO_MAGIC.into(), false));
         } else if self.any_start {
-            self.search("the file does not start with the magic bytes")?;
+            self.search(NO_MAGIC)?;
             if self.section == Section::Ended {
                 return Err(RecordsError::NoRecord);
             }
@@ -210,7 +218,7 @@ impl McapRecords {
                     self.end_indexes();
                     self.chunk = (content, 0);
                     self.chunk_bytes = (from, from + end as u64);
-                    (self.has_chunks, self.indexes_are_lost) = (true, false);
+                    (self.has_chunks, self.lost_from) = (true, None);
                     (self.indexes, self.lost_before_indexes) = (ChunkIndexes::default(), self.lost.len());
                     Ok(None)
                 }
@@ -310,9 +318,9 @@ impl McapRecords {
         if let Some(chunk) = private {
             self.add_lost(chunk, &"a chunk has the kind of other records");
         }
-        if self.indexes_are_lost {
+        if let Some(from) = self.lost_from {
             self.consume(end);
-            self.lost.last_mut().into_iter().for_each(|lost| lost.add_index(index));
+            self.lost.last_mut().into_iter().for_each(|lost| lost.add_index(index, from));
         } else {
             self.crc.update_wrong_index(self.offset, &self.buffer[self.start..self.start + end], &right);
             self.start += end;
@@ -333,7 +341,7 @@ impl McapRecords {
     fn add_lost(&mut self, bytes: (u64, u64), reason: &dyn std::fmt::Display) {
         let is_loss = matches!(self.section, Section::Start | Section::Data);
         self.lost.push(LostPart::new(bytes, reason.to_string(), is_loss));
-        self.indexes_are_lost = true;
+        self.lost_from = Some(0);
     }
 
     /// Consumes bytes up to the next record after the current position, or to the end of the file.
@@ -388,6 +396,14 @@ impl McapRecords {
             return Ok(false);
         }
         Ok(parse_strictly(opcode, &self.bytes()[body..end]).is_ok())
+    }
+
+    /// True if the header of a file is `at` bytes after the current position.
+    fn is_header_at(&mut self, at: usize) -> Result<bool, RecordsError> {
+        let (opcode, length) = head(&self.bytes()[at..]);
+        let (body, end) = (at + RECORD_HEAD_BYTES, at + RECORD_HEAD_BYTES + length.unwrap_or(RECORD_BYTES_MAX));
+        let is_whole = opcode == op::HEADER && length.is_some() && self.fill(end)?;
+        Ok(is_whole && parse_strictly(opcode, &self.bytes()[body..end]).is_ok())
     }
 
     /// True if the fields of a chunk start `at` bytes after the current position.
@@ -467,13 +483,6 @@ fn reason(opcode: u8, body: &[u8], error: &McapError) -> String {
         (op::METADATA, _) => format!("metadata: {error}"),
         _ => error.to_string(),
     }
-}
-
-fn wrong_crc(section: &str, calculated: u32, saved: u32) -> String {
-    format!(
-        "the CRC of the {section} section is {calculated:08x} and should be {saved:08x}: records outside of its chunks \
-         have changed"
-    )
 }
 
 fn u32_at(bytes: &[u8], at: usize) -> u32 {

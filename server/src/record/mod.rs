@@ -9,6 +9,7 @@
 //! | `section_crc` | the bytes of a section -> whether any has changed |
 //! | `bag_records` | a ROS 2 bag in sqlite -> the same records |
 //! | `file_records` | a file of either kind -> its records |
+//! | `record_counts` | records -> how many there are, and how many there should be |
 //! | `mcap_summary` | the end of an MCAP file -> its schemas and channels |
 //! | [`channel`] | the topic, schema and encoding of a channel -> the kind of its messages |
 //! | [`mcap_reader`] | those records -> the header and the messages |
@@ -31,6 +32,7 @@ pub mod mcap_reader;
 mod mcap_records;
 mod mcap_summary;
 pub mod reader;
+mod record_counts;
 pub mod repair;
 mod section_crc;
 pub mod verify;

@@ -27,6 +27,8 @@ pub struct Report {
     pub incomplete: Option<String>,
     /// True if the new file lacks a record, or may have a changed one.
     pub is_loss: bool,
+    /// True if the damaged file proves by its own counts that no message, attachment or metadata is lost.
+    pub has_all_records: bool,
     /// True if the file is a recording of clearway whose configuration is lost: the new one cannot be verified.
     pub lacks_config: bool,
 }
@@ -36,7 +38,7 @@ impl Report {
     pub fn to_json(&self) -> Value {
         json!({
             "messages": self.messages, "lost_messages": self.lost_messages, "incomplete": self.incomplete,
-            "is_loss": self.is_loss, "lacks_config": self.lacks_config,
+            "is_loss": self.is_loss, "has_all_records": self.has_all_records, "lacks_config": self.lacks_config,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
         })
     }
@@ -158,7 +160,8 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
         };
         copied.map_err(failed)?;
     }
-    report.lost_messages = reader.stated_messages().map(|_| reader.missing_messages());
+    report.lost_messages = reader.counts().stated_messages().map(|_| reader.missing_messages());
+    report.has_all_records = reader.counts().are_all_there();
     (report.damages, report.incomplete) = (reader.damages(), reader.incomplete());
     if report.messages == 0 {
         return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });

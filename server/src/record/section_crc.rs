@@ -59,3 +59,11 @@ impl SectionCrc {
         }
     }
 }
+
+/// What is wrong with a section whose bytes have changed.
+pub(super) fn wrong_crc(section: &str, calculated: u32, saved: u32) -> String {
+    format!(
+        "the CRC of the {section} section is {calculated:08x} and should be {saved:08x}: records outside of its chunks \
+         have changed"
+    )
+}

@@ -3,7 +3,8 @@
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
 //! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one.
 //! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which
-//! the file lacks are counted as unjudged: those after a gap, until the next keyframe.
+//! the file lacks are counted as unjudged: those after a gap, until the next keyframe. An event or a map that is not in
+//! its place says that the file has changed, not that a map differs.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,6 +19,7 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
+use crate::base::counted::counted;
 use crate::config::RecordedMaps;
 use crate::encode::{EncodedMap, as_served, as_served_with};
 use crate::record::damage::Damage;
@@ -25,11 +27,14 @@ use crate::record::mcap_file::sha256;
 use crate::record::reader::{Beginning, RecordedMessage, RecordingError, RecordingReader};
 
 mod difference;
+mod disorder;
 
 use difference::first_difference;
 pub use difference::{Difference, DifferenceKind};
+pub use disorder::Disorder;
 
-/// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
+/// Greatest number of differences, and of places out of order, in a report; all are counted. Ours: the first ones
+/// explain the others.
 const DIFFERENCES_MAX: usize = 20;
 
 /// The result of a verification.
@@ -69,8 +74,10 @@ pub struct Report {
     pub differences: Vec<Difference>,
     /// Number of all differences.
     pub different: u64,
-    /// Number of those that are gaps of a journal.
-    pub gaps: u64,
+    /// The first events and maps that do not stand in their place: behind a gap, behind a later one, or twice.
+    pub disorder: Vec<Disorder>,
+    /// Number of all of these.
+    pub disordered: u64,
 }
 
 /// A recording cannot be verified.
@@ -102,15 +109,30 @@ impl Report {
             "dropped": self.dropped, "dropped_because": self.dropped_because,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(), "repaired": self.repaired,
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
+            "disorder": self.disorder.iter().map(Disorder::to_json).collect::<Vec<_>>(), "disordered": self.disordered,
         })
     }
 
     fn add(&mut self, vehicle: &str, sequence: u64, layer: &str, kind: DifferenceKind) {
         self.different += 1;
-        self.gaps += u64::from(matches!(kind, DifferenceKind::Gap { .. }));
         if self.differences.len() < DIFFERENCES_MAX {
             self.differences.push(Difference { vehicle: vehicle.into(), sequence, layer: layer.into(), kind });
         }
+    }
+
+    fn add_disorder(&mut self, disorder: Disorder) {
+        self.disordered += 1;
+        if self.disorder.len() < DIFFERENCES_MAX {
+            self.disorder.push(disorder);
+        }
+    }
+
+    /// How the file is incomplete by its order alone. What the recorder has dropped, or what a repair could not read,
+    /// leaves a gap that is told already.
+    fn why_disordered(&self) -> Option<String> {
+        let first = self.disorder.first().filter(|_| self.dropped == 0 && self.repaired.is_empty())?;
+        let places = counted(self.disordered, "place");
+        Some(format!("its messages are not as they were written in {places}, the first: {first}"))
     }
 }
 
@@ -126,8 +148,14 @@ struct VehicleReplay {
     warm_up: Option<Pipeline>,
     valid_ms: u32,
     records: RecordedMaps,
-    /// Sequence of the next event; `None` before the first one.
+    /// Sequence of the next event of the maps; `None` before the first one.
     next_event: Option<u64>,
+    /// Sequence of the event that follows the newest one of the file, which may be an earlier one.
+    next_of_file: Option<u64>,
+    /// True while a keyframe repeats the events that are in force.
+    repeats: bool,
+    /// Sequence of the newest map that was compared, by layer.
+    newest_maps: BTreeMap<String, u64>,
     /// True if events are missing before this one, until the next keyframe; the maps need not equal the computed ones.
     lacks_events: bool,
     /// Computed maps that are not compared yet, by sequence and layer.
@@ -159,6 +187,9 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             valid_ms: vehicle.maps.valid_ms,
             records: recording.maps(),
             next_event: is_first_part.then_some(0),
+            next_of_file: is_first_part.then_some(0),
+            repeats: false,
+            newest_maps: BTreeMap::new(),
             lacks_events: false,
             computed: BTreeMap::new(),
         });
@@ -217,19 +248,18 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
         let differs = format!("its metadata has the boot id {stated_boot_id}, and its maps have {boot_id}");
         report.incomplete.get_or_insert(differs);
     }
-    // Only its end says so: then the messages were written, and cut out of the file later.
-    let lacks_messages = recording.missing_messages() > 0;
-    if lacks_messages {
-        report.different -= std::mem::take(&mut report.gaps);
-        report.differences.retain(|difference| !matches!(difference.kind, DifferenceKind::Gap { .. }));
+    if let Some(disorder) = report.why_disordered() {
+        report.incomplete.get_or_insert(disorder);
     }
+    // Then the messages were written, and something else has changed the file later.
+    let has_changed = recording.missing_messages() > 0 || recording.loss_count() > 0 || report.disordered > 0;
     for replay in &replays {
         // The recorder writes an event before its map, so a cut can remove only the map of the last event.
         let tail = replay.computed.last_key_value().map(|((sequence, _), _)| *sequence);
         for (sequence, layer) in replay.computed.keys() {
             if report.cut && Some(*sequence) == tail {
                 report.beyond_cut += 1;
-            } else if replay.lacks_events || lacks_messages || recording.loss_count() > 0 {
+            } else if replay.lacks_events || has_changed {
                 report.unjudged += 1;
             } else {
                 report.add(&replay.name, *sequence, layer, DifferenceKind::Missing);
@@ -246,6 +276,8 @@ impl VehicleReplay {
             v1::KeyframePhase::WarmUp => {
                 self.warm_up = Some(Pipeline::new(&self.config, self.tables.clone())?);
                 self.next_event.get_or_insert(keyframe.first_event);
+                self.next_of_file.get_or_insert(keyframe.first_event);
+                self.repeats = true;
             }
             v1::KeyframePhase::Begin => {
                 if let Some(mut pipeline) = self.warm_up.take() {
@@ -267,15 +299,21 @@ impl VehicleReplay {
             let _ = warm_up.step(event);
         }
         let expected = self.next_event.unwrap_or(event.sequence);
-        // An event that is repeated for a keyframe was processed before.
+        self.repeats &= event.sequence < expected;
+        if self.repeats {
+            return;
+        }
+        let place = self.next_of_file.replace(event.sequence.saturating_add(1)).unwrap_or(event.sequence);
+        if event.sequence != place && !(is_damaged && self.lacks_events) {
+            let (vehicle, found) = (self.name.to_string(), event.sequence);
+            report.add_disorder(Disorder::Event { vehicle, expected: place, found });
+        }
+        // One that was processed before.
         if event.sequence < expected {
             return;
         }
         self.next_event = Some(event.sequence.saturating_add(1));
         if event.sequence > expected {
-            if !(is_damaged && self.lacks_events) {
-                report.add(&self.name, expected, "", DifferenceKind::Gap { found: event.sequence });
-            }
             (self.lacks_events, self.warm_up) = (true, None);
         }
         let Some(pipeline) = &mut self.pipeline else { return };
@@ -289,10 +327,23 @@ impl VehicleReplay {
         }
     }
 
+    /// The computed layer of this sequence, if there is one; `None` for a map that is in the file again.
+    fn computed_of(&mut self, layer: &str, sequence: u64, report: &mut Report) -> Option<Option<Bytes>> {
+        let computed = self.computed.remove(&(sequence, layer.to_owned()));
+        if computed.is_some() {
+            self.newest_maps.insert(layer.to_owned(), sequence);
+        } else if self.newest_maps.get(layer).is_some_and(|newest| sequence <= *newest) {
+            let (vehicle, layer) = (self.name.to_string(), layer.to_owned());
+            report.add_disorder(Disorder::Map { vehicle, layer, sequence });
+            return None;
+        }
+        Some(computed)
+    }
+
     /// Compares a recorded layer with the computed one.
     fn compare(&mut self, layer: &str, bytes: &Bytes, report: &mut Report) {
         let (sequence, cells) = sequence_and_cells(bytes);
-        let computed = self.computed.remove(&(sequence, layer.to_owned()));
+        let Some(computed) = self.computed_of(layer, sequence, report) else { return };
         report.cells += if computed.is_some() { cells } else { 0 };
         match computed.map(|computed| as_served(computed, bytes)) {
             Some(computed) if computed == *bytes => report.equal += 1,
@@ -306,7 +357,7 @@ impl VehicleReplay {
     fn compare_digest(&mut self, layer: &str, digest: v1::MapDigest, report: &mut Report) {
         let v1::MapDigest { header, sha256: recorded } = digest;
         let sequence = header.as_ref().map_or(u64::MAX, |header| header.sequence);
-        let computed = self.computed.remove(&(sequence, layer.to_owned()));
+        let Some(computed) = self.computed_of(layer, sequence, report) else { return };
         report.cells += computed.as_ref().map_or(0, |computed| sequence_and_cells(computed).1);
         match computed.map(|computed| sha256(&as_served_with(computed, header))) {
             Some(computed) if computed == recorded => report.equal += 1,

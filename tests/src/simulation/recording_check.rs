@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use clearway::record::mcap_file::Disk;
 use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::record::verify::{DifferenceKind, Report, verify};
+use clearway::record::verify::{Difference, DifferenceKind, Report, verify};
 use clearway::record::writer::{Files, RecorderCounts};
 
 use super::checks::{Violation, violation};
@@ -182,10 +182,13 @@ impl Recorded {
     }
 
     fn check_report(&self, part: u64, file: &MemoryFile, report: &Report) -> Result<(), Violation> {
-        let is_loss = |kind: &DifferenceKind| matches!(kind, DifferenceKind::Gap { .. } | DifferenceKind::Missing);
-        let wrong = report.differences.iter().find(|difference| self.lost == 0 || !is_loss(&difference.kind));
+        let is_loss = |of: &Difference| of.kind == DifferenceKind::Missing;
+        let wrong = report.differences.iter().find(|difference| self.lost == 0 || !is_loss(difference));
         if let Some(difference) = wrong {
             return Err(violation("recording", format!("part {part}, lost {}: {difference}", self.lost)));
+        }
+        if let Some(disorder) = report.disorder.first().filter(|_| self.lost == 0) {
+            return Err(violation("recording", format!("part {part}: {disorder}")));
         }
         if file.is_complete && (report.cut || !report.is_closed) {
             return Err(violation("recording", format!("part {part} has its name and is not whole")));

@@ -44,7 +44,12 @@ pub fn run(options: &Options) -> Result<Exit> {
         let messages = counted(report.messages, "message");
         print_line(&format!("{} has {messages} of {}", options.output.display(), options.input.display()))?;
         for damage in &report.damages {
-            print_line(&format!("{}: {damage}", if damage.is_loss { "lost" } else { "damaged, and nothing is lost" }))?;
+            let effect = match (damage.is_loss, report.has_all_records) {
+                (false, _) => "damaged, and nothing is lost",
+                (true, true) => "changed, and no record is lost",
+                (true, false) => "lost",
+            };
+            print_line(&format!("{effect}: {damage}"))?;
         }
         if let Some(incomplete) = &report.incomplete {
             print_line(&format!("{} is not whole: {incomplete}", options.input.display()))?;

@@ -65,7 +65,7 @@ impl Source {
         self.capture.offset()
     }
 
-    /// Where and how the file is truncated; known after the last reading.
+    /// Where and how the file is truncated or damaged, which ends its readings; known after the last one.
     pub fn truncated(&self) -> Option<String> {
         self.truncated.clone()
     }
@@ -91,7 +91,7 @@ impl Iterator for Source {
         loop {
             let datagram = match self.capture.next()? {
                 Ok(datagram) => datagram,
-                Err(error @ Error::Truncated { .. }) => {
+                Err(error @ (Error::Truncated { .. } | Error::Damaged { .. })) => {
                     self.truncated = Some(error.to_string());
                     return None;
                 }

@@ -15,9 +15,9 @@ use serde_json::{Value, json};
 pub struct Difference {
     /// The vehicle's name.
     pub vehicle: String,
-    /// Sequence of the map, or of the first missing event.
+    /// Sequence of the map.
     pub sequence: u64,
-    /// The layer's name; empty for missing events.
+    /// The layer's name.
     pub layer: String,
     /// The first difference of the map.
     pub kind: DifferenceKind,
@@ -52,11 +52,6 @@ pub enum DifferenceKind {
     Missing,
     /// The recording has this map, which does not follow from the events.
     Extra,
-    /// The journal lacks the events from the difference's sequence up to `found`.
-    Gap {
-        /// Sequence of the next event in the journal.
-        found: u64,
-    },
 }
 
 impl Difference {
@@ -71,7 +66,6 @@ impl Difference {
             }
             DifferenceKind::Missing => json!("missing"),
             DifferenceKind::Extra => json!("extra"),
-            DifferenceKind::Gap { found } => json!({ "gap": { "found": found } }),
         };
         json!({ "vehicle": self.vehicle, "sequence": self.sequence, "layer": self.layer, "what": kind })
     }
@@ -80,9 +74,6 @@ impl Difference {
 impl fmt::Display for Difference {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { vehicle, sequence, layer, kind } = self;
-        if let DifferenceKind::Gap { found } = kind {
-            return write!(f, "vehicle {vehicle}: the journal lacks events {sequence} to {}", found.saturating_sub(1));
-        }
         write!(f, "vehicle {vehicle}, sequence {sequence}, layer {layer}: ")?;
         match kind {
             DifferenceKind::Cell { row, column, channel, recorded, computed } => {
@@ -92,7 +83,7 @@ impl fmt::Display for Difference {
                 write!(f, "{field}: recorded {recorded}, computed {computed}")
             }
             DifferenceKind::Missing => write!(f, "the recording lacks this map of the events"),
-            DifferenceKind::Extra | DifferenceKind::Gap { .. } => {
+            DifferenceKind::Extra => {
                 write!(f, "the recording has this map, which does not follow from the events")
             }
         }

@@ -349,7 +349,7 @@ fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
 }
 
 /// The folder of a file.
-fn parent_of(file: &Path) -> &Path {
+pub fn parent_of(file: &Path) -> &Path {
     file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 

@@ -38,13 +38,19 @@ impl Clouds {
     /// Creates the folder, unless it exists.
     ///
     /// # Errors
-    /// [`CloudError`] if a file has its name, or it cannot be created.
+    /// [`CloudError`] if a file has its name, if point clouds are in it, or if it cannot be created.
     pub fn create(folder: &Path) -> Result<Self, CloudError> {
         let wrong = |source| CloudError { file: folder.to_owned(), source };
         if folder.is_file() {
             return Err(wrong(Error::new(ErrorKind::NotADirectory, "this is a file; name a folder")));
         }
         std::fs::create_dir_all(folder).map_err(|source| wrong(advised(folder, source)))?;
+        let entries = std::fs::read_dir(folder).map_err(|source| wrong(advised(folder, source)))?;
+        let is_cloud = |path: &Path| path.extension().is_some_and(|extension| extension == "pcd");
+        if entries.filter_map(Result::ok).any(|entry| is_cloud(&entry.path())) {
+            let advice = "point clouds are in this folder, and none is overwritten; name another folder";
+            return Err(wrong(Error::new(ErrorKind::AlreadyExists, advice)));
+        }
         Ok(Self { folder: folder.to_owned() })
     }
 
@@ -58,7 +64,7 @@ impl Clouds {
             let mut written = locked(&written);
             let Ok(count) = *written else { return };
             let file = self.folder.join(format!("{:06}.pcd", revolution.sequence));
-            let done = std::fs::File::create(&file).and_then(|mut open| open.write_all(&pcd(revolution)));
+            let done = std::fs::File::create_new(&file).and_then(|mut open| open.write_all(&pcd(revolution)));
             *written = done.map(|()| count + 1).map_err(|source| CloudError { source: advised(&file, source), file });
         });
         (observer, count)

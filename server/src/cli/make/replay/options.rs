@@ -38,8 +38,8 @@ pub struct Options {
     /// Record the events and the maps to this MCAP file, which must not exist.
     #[arg(long, value_name = "OUT.mcap")]
     pub record: Option<PathBuf>,
-    /// Replace the file of --record if it exists, when the new one is whole. If the replay ends before, or a file is not
-    /// whole or has no reading, the file keeps its name, and the new one is named OUT.early.mcap.
+    /// Replace the file of --record if it exists, when the new one is whole. If the replay ends before, or a file is
+    /// not whole or has no reading, the file keeps its name, and the new one is named OUT.early.mcap.
     #[arg(long, requires = "record")]
     pub force: bool,
     /// Speed of the replay: as-recorded, max, or a factor such as 0.5 [default: max; as-recorded with --serve].
@@ -227,6 +227,14 @@ pub enum ReplayError {
     RecordsInput {
         /// The file.
         file: PathBuf,
+    },
+    /// The recording would replace the file of another option.
+    #[error("--record {}: this is the file of {option}; name another file", file.display())]
+    RecordOfOption {
+        /// The file.
+        file: PathBuf,
+        /// The option.
+        option: &'static str,
     },
     /// The recording would replace a folder, a pipe or a device.
     #[error("--record {}: this is a folder, a pipe or a device; name a file", file.display())]

@@ -20,7 +20,7 @@ use super::record_file::check_record;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
 use crate::cli::shared::ground_revolutions::{GroundRevolutions, points_of};
-use crate::config::{Calibrations, Config, Origin, RecordedMaps, Recorder};
+use crate::config::{Calibrations, Config, Origin, Recorder};
 use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
@@ -280,10 +280,6 @@ impl Known {
         let mut config = if options.serve { config.located(file) } else { config };
         config.recorder.file = options.record.clone().unwrap_or_default();
         config.recorder.replaces = options.force;
-        // A replay of a recording without maps makes them.
-        if options.config.is_none() {
-            config.recorder.maps = RecordedMaps::Full;
-        }
         if !options.serve {
             (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
             (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
@@ -362,7 +358,7 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
         if recording.header().config.is_some() {
             let (mut config, mut tables) = recording.config()?;
             pick(file, &mut config, &mut tables)?;
-            // The publishers and files of the recorded run are not those of this run.
+            // The publishers, the files and the recorder of the recorded run are not those of this run.
             let config = overridden(Config { vehicles: config.vehicles, ..Config::default() }, options, file)?;
             return Ok(known(config, tables, Some(recording.header().boot_id), true));
         }

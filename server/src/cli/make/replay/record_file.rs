@@ -5,7 +5,7 @@ use std::io::Error;
 use std::path::{Path, PathBuf};
 
 use super::options::{Options, ReplayError};
-use crate::record::writer::{is_same_file, later_part_of, next_free_name, unfinished_name};
+use crate::record::writer::{is_same_file, later_part_of, next_free_name, parent_of, unfinished_name};
 
 /// Refuses a file of `--record` that is replayed, is no file, or may not be replaced.
 ///
@@ -24,11 +24,22 @@ pub(super) fn check_record(options: &Options, record: &Path) -> Result<(), Repla
     if options.files.iter().any(|file| is_same_file(file, record) || is_in(file)) {
         return Err(ReplayError::RecordsInput { file: record.to_owned() });
     }
+    let others = [
+        ("--config", &options.config),
+        ("--calibration", &options.calibration),
+        ("--fault-script", &options.fault_script),
+        ("--ready-file", &options.ready_file),
+    ];
+    if let Some((option, _)) =
+        others.into_iter().find(|(_, file)| file.as_deref().is_some_and(|file| is_one(file, record)))
+    {
+        return Err(ReplayError::RecordOfOption { file: record.to_owned(), option });
+    }
     let is_folder = record.as_os_str().as_encoded_bytes().ends_with(b"/");
     if is_folder || record.metadata().is_ok_and(|of| !of.is_file()) {
         return Err(ReplayError::RecordNoFile { file: record.to_owned() });
     }
-    let folder = record.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = parent_of(record);
     if let Some(folder) = options.files.iter().find(|file| is_same_file(file, folder)) {
         return Err(ReplayError::RecordsIntoInput { file: record.to_owned(), folder: folder.clone() });
     }
@@ -51,6 +62,11 @@ pub(super) fn check_record(options: &Options, record: &Path) -> Result<(), Repla
         return Err(ReplayError::RecordParts { file: record.to_owned(), part });
     }
     Ok(())
+}
+
+/// True if both name one file, also one that does not exist yet.
+fn is_one(a: &Path, b: &Path) -> bool {
+    is_same_file(a, b) || (a.file_name() == b.file_name() && is_same_file(parent_of(a), parent_of(b)))
 }
 
 /// The recording that `--force` replaces, under a second name until the new one is whole.
@@ -98,7 +114,7 @@ impl Former {
 
 /// Removes the second names of `record` that killed replays have left, and names former recordings that they have left.
 fn remove_left(record: &Path, name: &str) {
-    let folder = record.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = parent_of(record);
     for entry in std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok) {
         let file_name = entry.file_name().to_string_lossy().into_owned();
         let process = file_name.strip_prefix(&format!(".{name}.")).and_then(|rest| rest.strip_suffix(".former"));

@@ -17,6 +17,8 @@ use mcap::records::op;
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
+mod changed;
+
 /// Events and maps of the golden recording.
 const GOLDEN: (u64, u64) = (172, 3);
 
@@ -196,7 +198,7 @@ fn a_repaired_recording_is_whole_and_has_all_that_can_be_read() {
     let verified = clearway(&["verify", "repaired.mcap"]);
     let said = text(&verified.stdout);
     assert_eq!(verified.status.code(), Some(0), "{said}");
-    assert!(said.contains("what was lost in 3 places is no difference, the first: "), "{said}");
+    assert!(said.contains("what was lost in 2 places is no difference, the first: "), "{said}");
 
     let again = clearway(&["repair", "damaged.mcap", "repaired.mcap"]);
     assert_eq!(again.status.code(), Some(2));
