@@ -302,6 +302,19 @@ pub fn rechunk(bytes: &[u8], chunk_bytes: u64) -> mcap::McapResult<Vec<u8>> {
 /// # Errors
 /// If the recording is not whole.
 pub fn rewritten(bytes: &[u8], options: mcap::WriteOptions) -> mcap::McapResult<Vec<u8>> {
+    let messages = mcap::MessageStream::new(bytes)?.collect::<mcap::McapResult<Vec<_>>>()?;
+    with_messages(bytes, &messages, options)
+}
+
+/// The metadata and attachments of a recording with these messages, written with these options.
+///
+/// # Errors
+/// If the recording is not whole.
+pub fn with_messages(
+    bytes: &[u8],
+    messages: &[mcap::Message<'_>],
+    options: mcap::WriteOptions,
+) -> mcap::McapResult<Vec<u8>> {
     let mut writer = options.create(Cursor::new(Vec::new()))?;
     for record in mcap::read::LinearReader::new(bytes)? {
         match record? {
@@ -313,8 +326,8 @@ pub fn rewritten(bytes: &[u8], options: mcap::WriteOptions) -> mcap::McapResult<
             _ => {}
         }
     }
-    for message in mcap::MessageStream::new(bytes)? {
-        writer.write(&message?)?;
+    for message in messages {
+        writer.write(message)?;
     }
     writer.finish()?;
     Ok(writer.into_inner().into_inner())

@@ -237,8 +237,23 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
         let serve = if option == "--ready-file" { &["--serve", "--any-port", "--exit-at-end"][..] } else { &[] };
         let (success, error) =
             replay(&[&["drive.pcap", option, file, "--force", "--record", file][..], serve].concat());
-        let expected = format!("--record {file}: this is the file of {option}; name another file");
+        let expected = format!("--record {file}: this is the file of {option}, or written under its name");
         assert!(!success && error.contains(&expected), "{error}");
+    }
+    let served = ["--serve", "--any-port", "--exit-at-end", "--ready-file", "new.unfinished.mcap"];
+    let (success, error) = replay(&[&["drive.pcap", "--record", "new.mcap"][..], &served].concat());
+    assert!(!success && error.contains("this is the file of --ready-file, or written under"), "{error}");
+    // Neither is the file of another program, nor that of a replay that still runs, its own.
+    let own = std::process::id();
+    let running = serde_json::json!({
+        "pid": own, "grpc": null, "page": null, "zenoh": [], "foxglove": null, "vehicles": []
+    });
+    for other in [r#"{"pid": 1, "name": "a daemon"}"#, &running.to_string()] {
+        std::fs::write(at("ready.json"), other).unwrap();
+        let served = ["--serve", "--any-port", "--exit-at-end", "--ready-file", "ready.json"];
+        let (success, error) = replay(&[&["drive.pcap"][..], &served].concat());
+        assert!(!success && error.contains("--ready-file ready.json: "), "{error}");
+        assert_eq!(std::fs::read_to_string(at("ready.json")).unwrap(), other);
     }
     assert_eq!(std::fs::read_to_string(at("car.toml")).unwrap(), wide);
     let left = std::fs::read(at("busy.unfinished.mcap")).unwrap();
@@ -275,7 +290,7 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
     let (success, error) = replay(&["a.mcap", "--serve", "--any-port", "--exit-at-end", "--ready-file", "a.mcap"]);
     assert!(!success && error.contains("not that of an earlier replay"), "{error}");
     let verify = clearway_tests::run(folder.path(), "clearway", &["verify", "a.mcap", "--junit", "a.mcap"]);
-    assert!(String::from_utf8_lossy(&verify.stderr).contains("the file exists and is no XML"), "{verify:?}");
+    assert!(String::from_utf8_lossy(&verify.stderr).contains("is not an earlier report"), "{verify:?}");
     assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "the recording is unchanged");
     std::fs::write(at("c.part-0002.mcap"), "old").unwrap();
     let (success, error) = replay(&["a.mcap", "--record", "c.mcap"]);

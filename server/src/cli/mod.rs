@@ -37,7 +37,7 @@ use make::demo;
 use make::{replay, serve, view};
 use shared::exit::{EXIT_CODES, Exit};
 use shared::logs;
-use shared::output::with_causes;
+use shared::output::{printable, with_causes};
 #[cfg(feature = "sim")]
 use sources::simulate;
 use sources::{ingest, send};
@@ -126,7 +126,7 @@ pub fn main() -> ExitCode {
         Err(error) => match error.downcast::<clap::Error>() {
             Ok(usage) => print_usage(&usage),
             Err(error) => {
-                eprintln!("clearway: {}", with_causes(&error));
+                eprintln!("clearway: {}", printable(&with_causes(&error)));
                 Exit::Unreadable.into()
             }
         },

@@ -156,6 +156,16 @@ pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
     parse_record(opcode, body)
 }
 
+/// The number of four bytes at this position.
+pub(super) fn u32_at(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
+}
+
+/// The number of eight bytes at this position.
+pub(super) fn u64_at(bytes: &[u8], at: usize) -> u64 {
+    u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes"))
+}
+
 #[cfg(test)]
 mod tests {
     use std::io::Write;

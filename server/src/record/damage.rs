@@ -35,8 +35,10 @@ impl LostPart {
     /// damage of the index.
     pub(super) fn add_index(&mut self, index: &MessageIndex, from: u64) {
         let lost = || index.records.iter().filter(|entry| entry.offset >= from);
-        if lost().next().is_some() {
-            *self.messages.entry(index.channel_id).or_default() += lost().count() as u64;
+        // An index may be in the file twice.
+        let count = lost().count() as u64;
+        if count > 0 {
+            self.messages.entry(index.channel_id).and_modify(|lost| *lost = count.max(*lost)).or_insert(count);
         }
         let (first, last) = self.chunk_ns.unwrap_or((0, u64::MAX));
         for at in lost().map(|entry| entry.log_time).filter(|at| (first..=last).contains(at)) {

@@ -67,6 +67,15 @@ impl FileRecords {
         }
     }
 
+    /// True if bytes follow the end that its writer has made.
+    pub(super) fn has_more(&self) -> bool {
+        match self {
+            Self::Mcap(records) => records.has_more(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(_) => false,
+        }
+    }
+
     /// True if the file's own counts can be trusted.
     pub(super) fn has_sound_counts(&self) -> bool {
         match self {

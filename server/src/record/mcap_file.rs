@@ -33,7 +33,7 @@ use mcap::write::NoSeek;
 use mcap::{Attachment, McapError, WriteOptions};
 use prost::Message;
 
-use super::mcap_reader::FORMAT;
+use super::header::FORMAT;
 use crate::base::sync::locked;
 use crate::config::{Compression, RecordedMaps, Recorder as Options};
 use crate::encode::{self, EncodedMap};

@@ -5,7 +5,7 @@
 //! every message that is whole, and [`McapReader::incomplete`] then says what is missing. A chunk whose CRC is wrong is
 //! damaged as a whole.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use clearway_proto::v1;
 use clearway_ros::Kind;
-use mcap::records::{Metadata, Record};
+use mcap::records::Record;
 use prost::Message as _;
 
 use crate::base::counted::counted;
@@ -22,31 +22,20 @@ use crate::base::file_advice::advised;
 use super::channel::{Channel, Content};
 use super::damage::Damage;
 use super::file_records::FileRecords;
+use super::header::{FORMAT, Format};
 use super::mcap_records::{McapRecords, RecordsError};
 use super::mcap_summary;
+use super::message_order::MessageOrder;
 use super::record_counts::RecordCounts;
 
-/// Version of the contents of our recordings, in their metadata. A recording without one has version 1.
-pub const FORMAT: u32 = 1;
+pub use super::header::Header;
+
 /// The name of the metadata that a repaired file has at each place at which a part of the damaged file is lost.
 pub(super) const REPAIR_METADATA: &str = "clearway-repair";
 /// The key of what is lost there.
 pub(super) const REPAIR_LOST_KEY: &str = "lost";
 /// The packages of the messages that this version reads.
 const PACKAGES: [&str; 1] = ["clearway.v1."];
-
-/// The contents of a recording before its first message; empty in an MCAP file of another program.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Header {
-    /// Identifies the run of the server that made the maps; 0 in a file of another program.
-    pub boot_id: u64,
-    /// The metadata `clearway`.
-    pub metadata: BTreeMap<String, String>,
-    /// The effective configuration, TOML.
-    pub config: Option<String>,
-    /// The configured calibration tables: attachment name, ROS YAML.
-    pub calibrations: BTreeMap<String, String>,
-}
 
 /// One message of an MCAP file.
 #[derive(Clone, Debug, PartialEq)]
@@ -156,10 +145,11 @@ pub struct McapReader {
     /// Number of messages of channels that no record describes.
     unknown: u64,
     counts: RecordCounts,
+    order: MessageOrder,
+    /// Number of lost parts before the newest message.
+    losses_before: usize,
     /// What a repair could not read, in file order.
     repaired: Vec<String>,
-    /// True if the format in the metadata is damaged.
-    has_wrong_format: bool,
     has_ended: bool,
 }
 
@@ -204,8 +194,9 @@ impl McapReader {
             first: None,
             unknown: 0,
             counts: RecordCounts::default(),
+            order: MessageOrder::default(),
+            losses_before: 0,
             repaired: Vec::new(),
-            has_wrong_format: false,
             has_ended: false,
         }
     }
@@ -238,14 +229,6 @@ impl McapReader {
     /// Number of damaged parts so far.
     pub fn damage_count(&self) -> usize {
         self.records.lost().len()
-    }
-
-    /// The contents of a metadata record, with the format of the file if it is damaged there.
-    pub(super) fn with_known_format(&self, mut metadata: Metadata) -> Metadata {
-        if self.has_wrong_format && metadata.name == "clearway" {
-            metadata.metadata.insert("format".into(), FORMAT.to_string());
-        }
-        metadata
     }
 
     /// Number of damaged parts so far whose contents no other record repeats.
@@ -282,44 +265,32 @@ impl McapReader {
         if self.is_cut() {
             faults.push(format!("cut after {} bytes: the closing records are missing", self.bytes_read()));
         }
-        if self.has_ended && self.has_wrong_format {
-            let of = |key: &str| self.header.metadata.get(key).map_or("", |value| value);
-            let (format, version) = (of("format"), of("version"));
-            faults.push(format!("its metadata has format {format:?}, which clearway {version} has never written"));
-        }
         if self.has_ended && self.unknown > 0 {
             faults.push(format!("{} of channels that the file does not describe", counted(self.unknown, "message")));
         }
-        faults.extend(self.faults_of_header());
-        let lost = self.records.lost().iter();
-        let named = (self.damage_count() > 0).then(|| lost.flat_map(|part| part.messages.values()).sum());
-        faults.extend(self.counts.fault(named, |id| self.topic(id)));
+        if !self.has_ended {
+            return faults;
+        }
+        faults.extend(self.counts.faults(self.named_losses(), |id| self.topic(id)));
+        // A repaired file says what it lacks where it was lost.
+        if self.repaired.is_empty() {
+            faults.extend(self.order.fault(self.counts.has_dropped()));
+            if self.has(|content| matches!(content, Content::Journal { .. })) {
+                let has_maps = self.has(|content| matches!(content, Content::Map { .. } | Content::Digest { .. }));
+                faults.extend(self.header.faults(has_maps));
+            }
+        }
         faults
     }
 
-    /// What a recording of clearway lacks to be verified, if this is one. A repaired file says it where it was lost.
-    fn faults_of_header(&self) -> Vec<String> {
-        let has = |is: fn(&Content) -> bool| {
-            self.channels.iter().any(|(id, of)| is(&of.content) && self.counts.has_message_of(*id))
-        };
-        if !self.has_ended || !self.repaired.is_empty() || !has(|of| matches!(of, Content::Journal { .. })) {
-            return Vec::new();
-        }
-        let mut faults = Vec::new();
-        let of = |key: &str| self.header.metadata.get(key).map(String::as_str);
-        if self.header.boot_id == 0 {
-            faults.push(format!("its metadata has the boot id {:?}, which is none", of("boot_id").unwrap_or_default()));
-        }
-        let has_maps = has(|of| matches!(of, Content::Map { .. } | Content::Digest { .. }));
-        if has_maps && of("maps") == Some("none") {
-            faults.push("its metadata says that no map is recorded, and maps are".into());
-        }
-        match self.header.config.as_ref().map(|text| text.parse::<toml::Table>()) {
-            None => faults.push("it has no config.toml, so its maps cannot be made again".into()),
-            Some(Err(error)) => faults.push(format!("its config.toml cannot be read: {}", error.message())),
-            Some(Ok(_)) => {}
-        }
-        faults
+    /// True if a message of a channel with such content was read.
+    fn has(&self, is: fn(&Content) -> bool) -> bool {
+        self.channels.iter().any(|(id, of)| is(&of.content) && self.counts.has_message_of(*id))
+    }
+
+    /// Number of lost messages that the damaged parts name.
+    fn named_losses(&self) -> u64 {
+        self.records.lost().iter().flat_map(|part| part.messages.values()).sum()
     }
 
     /// True if the faults of [`McapReader::faults_of_end`] may have cost a record. A file that is cut after its data
@@ -329,14 +300,22 @@ impl McapReader {
         self.faults_of_end().len() > harmless
     }
 
-    /// How many records the file has, and how many it should have.
-    pub(super) fn counts(&self) -> &RecordCounts {
-        &self.counts
+    /// Number of messages that are lost, by the file's own counts or as its damaged parts name them; `None` before the
+    /// last message, or without counts that can be trusted.
+    pub(super) fn lost_messages(&self) -> Option<u64> {
+        // What is in the file twice hides in the counts what is lost.
+        self.counts.missing_messages(|id| self.topic(id)).map(|missing| missing.max(self.named_losses()))
     }
 
-    /// Number of messages that the file lacks by its own count, if that can be trusted; 0 before the last message.
-    pub fn missing_messages(&self) -> u64 {
-        self.counts.missing_messages()
+    /// True if the file proves by its own counts that it has all messages, attachments and metadata.
+    pub(super) fn has_all_records(&self) -> bool {
+        self.named_losses() == 0 && !self.records.has_more() && self.counts.are_all_there(|id| self.topic(id))
+    }
+
+    /// True if the messages are not all there or not as they were written, by what the file says of them. Known after
+    /// the last message.
+    pub fn lacks_messages(&self) -> bool {
+        self.lost_messages().is_some_and(|lost| lost > 0) || self.order.fault(false).is_some()
     }
 
     fn topic(&self, id: u16) -> String {
@@ -386,7 +365,7 @@ impl McapReader {
         };
         let Some(mut record) = record else {
             self.has_ended = true;
-            self.counts.end(self.records.has_sound_counts());
+            self.counts.end(self.records.has_sound_counts(), !self.repaired.is_empty());
             return Ok(None);
         };
         let is_unknown = |id: &u16| !self.channels.contains_key(id);
@@ -416,43 +395,31 @@ impl McapReader {
                 let content = Content::of(&of.topic, &schema, &of.message_encoding);
                 self.channels.insert(of.id, Arc::new(Channel { topic: of.topic.clone(), schema, content }));
             }
-            Record::Message { header, .. } => {
-                self.unknown += u64::from(!self.channels.contains_key(&header.channel_id));
-            }
-            Record::Metadata(metadata) if metadata.name == "clearway" => {
-                let boot_id = metadata.metadata.get("boot_id").and_then(|id| id.parse().ok());
-                self.header.boot_id = boot_id.unwrap_or_default();
-                self.header.metadata.clone_from(&metadata.metadata);
-                self.has_wrong_format = !self.has_known_format()?;
+            Record::Message { header, data } => {
+                let losses = self.loss_count();
+                let has_loss = std::mem::replace(&mut self.losses_before, losses) < losses;
+                match self.channels.get(&header.channel_id) {
+                    None => self.unknown += 1,
+                    Some(of) if of.content == Content::Counts => {
+                        self.counts.add_recorder(v1::RecordingCounts::decode(&data[..]).unwrap_or_default());
+                    }
+                    Some(of) => self.order.add(of, data, has_loss),
+                }
             }
             Record::Metadata(metadata) if metadata.name == REPAIR_METADATA => {
                 self.repaired.extend(metadata.metadata.get(REPAIR_LOST_KEY).cloned());
             }
-            Record::Attachment { header, data, .. } => {
-                let text = String::from_utf8_lossy(data).into_owned();
-                if header.name == "config.toml" {
-                    self.header.config = Some(text);
-                } else if header.name.starts_with("calibration/") {
-                    self.header.calibrations.insert(header.name.clone(), text);
+            Record::Metadata(metadata) => {
+                self.header.add_metadata(metadata);
+                if self.header.format() == Format::Later {
+                    let found = format!("format {}", self.header.value("format"));
+                    return Err(self.version_error(found, format!("formats up to {FORMAT}")));
                 }
             }
+            Record::Attachment { header, data, .. } => self.header.add_attachment(header, data),
             _ => {}
         }
         Ok(())
-    }
-
-    /// False if the format is one that the version that wrote the file cannot have written: then the metadata, which
-    /// no checksum of its own covers, is damaged. An error if a later version wrote the file.
-    fn has_known_format(&self) -> Result<bool, McapReadError> {
-        let Some(found) = self.header.metadata.get("format") else { return Ok(true) };
-        if matches!(found.parse::<u32>(), Ok(1..=FORMAT)) {
-            return Ok(true);
-        }
-        let by = self.header.metadata.get("version").and_then(|by| version_numbers(by));
-        match by.is_some_and(|by| Some(by) <= version_numbers(env!("CARGO_PKG_VERSION"))) {
-            true => Ok(false),
-            false => Err(self.version_error(format!("format {found}"), format!("formats up to {FORMAT}"))),
-        }
     }
 
     fn check_version(&self, schema: &str) -> Result<(), McapReadError> {
@@ -482,11 +449,6 @@ impl Iterator for McapReader {
         self.has_ended |= matches!(next, Some(Err(_)));
         next
     }
-}
-
-/// The numbers of a version such as `0.1.0`, which compare as versions do.
-fn version_numbers(version: &str) -> Option<Vec<u32>> {
-    version.split('.').map(|number| number.parse().ok()).collect()
 }
 
 fn open(file: &Path, any_start: bool) -> Result<FileRecords, McapReadError> {

@@ -11,6 +11,7 @@ use mcap::{MAGIC, McapError};
 
 use super::chunk::{
     CHUNK_FIELDS_BYTES, RECORD_BYTES_MAX, RECORD_HEAD_BYTES, attachment_name, decompress, parse_strictly, split_record,
+    u32_at, u64_at,
 };
 use super::chunk_indexes::ChunkIndexes;
 use super::damage::LostPart;
@@ -80,6 +81,7 @@ pub(super) struct McapRecords {
     private: Option<(u64, u64)>,
     has_data_end: bool,
     has_footer: bool,
+    has_more: bool,
     has_sound_summary: bool,
     lost: Vec<LostPart>,
 }
@@ -105,6 +107,7 @@ impl McapRecords {
             private: None,
             has_data_end: false,
             has_footer: false,
+            has_more: false,
             has_sound_summary: false,
             lost: Vec::new(),
         }
@@ -123,6 +126,11 @@ impl McapRecords {
     /// True if the file has its closing records.
     pub(super) fn has_footer(&self) -> bool {
         self.has_footer
+    }
+
+    /// True if bytes follow the end of the file.
+    pub(super) fn has_more(&self) -> bool {
+        self.has_more
     }
 
     /// True if the file has a summary without damage, whose counts can be trusted.
@@ -296,14 +304,18 @@ impl McapRecords {
             self.add_lost((from, self.offset), &wrong_crc("summary", crc, saved));
         }
         self.section = Section::Ended;
-        self.has_footer = self.fill(MAGIC.len())? && self.bytes().starts_with(MAGIC);
-        if self.has_footer {
-            self.consume(MAGIC.len());
+        self.fill(MAGIC.len())?;
+        self.has_footer = self.bytes().starts_with(MAGIC);
+        let end = if self.has_footer { MAGIC.len() } else { 0 };
+        // A beginning of the magic bytes alone is a cut.
+        if self.has_footer || !MAGIC.starts_with(self.bytes()) {
+            self.consume(end);
             let end = self.offset;
             while self.fill(1)? {
                 self.consume(self.bytes().len());
             }
-            if self.offset > end {
+            self.has_more = self.offset > end;
+            if self.has_more {
                 let reason = "bytes after the end of the recording".into();
                 self.lost.push(LostPart::new((end, self.offset), reason, true));
             }
@@ -483,12 +495,4 @@ fn reason(opcode: u8, body: &[u8], error: &McapError) -> String {
         (op::METADATA, _) => format!("metadata: {error}"),
         _ => error.to_string(),
     }
-}
-
-fn u32_at(bytes: &[u8], at: usize) -> u32 {
-    u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
-}
-
-fn u64_at(bytes: &[u8], at: usize) -> u64 {
-    u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes"))
 }

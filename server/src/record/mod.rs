@@ -9,6 +9,8 @@
 //! | `section_crc` | the bytes of a section -> whether any has changed |
 //! | `bag_records` | a ROS 2 bag in sqlite -> the same records |
 //! | `file_records` | a file of either kind -> its records |
+//! | `header` | metadata and attachments -> what a recording says before its messages |
+//! | `message_order` | events and maps -> whether they stand as they were written |
 //! | `record_counts` | records -> how many there are, and how many there should be |
 //! | `mcap_summary` | the end of an MCAP file -> its schemas and channels |
 //! | [`channel`] | the topic, schema and encoding of a channel -> the kind of its messages |
@@ -27,10 +29,12 @@ mod chunk_indexes;
 pub mod compare;
 pub mod damage;
 mod file_records;
+mod header;
 pub mod mcap_file;
 pub mod mcap_reader;
 mod mcap_records;
 mod mcap_summary;
+mod message_order;
 pub mod reader;
 mod record_counts;
 pub mod repair;

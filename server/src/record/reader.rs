@@ -195,9 +195,10 @@ impl RecordingReader {
         self.reader.loss_count() + self.repaired().len()
     }
 
-    /// Number of messages that the file lacks by its own count, if that can be trusted; 0 before the last message.
-    pub fn missing_messages(&self) -> u64 {
-        self.reader.missing_messages()
+    /// True if the messages are not all there or not as they were written, by what the file says of them. Known after
+    /// the last message.
+    pub fn lacks_messages(&self) -> bool {
+        self.reader.lacks_messages()
     }
 
     /// How the file is incomplete: damaged, cut, or with fewer messages than it says. `None` for a complete file, and

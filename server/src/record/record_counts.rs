@@ -1,7 +1,9 @@
-//! The records of an MCAP file -> how many it has, and how many it should have by its own count.
+//! The records of an MCAP file -> how many it has, and how many it should have by its own counts: those of its summary,
+//! and of a recording those of the recorder.
 
 use std::collections::BTreeMap;
 
+use clearway_proto::v1;
 use mcap::records::{Record, Statistics};
 
 use crate::base::counted::counted;
@@ -13,7 +15,16 @@ pub(super) struct RecordCounts {
     attachments: u32,
     metadata: u32,
     stated: Option<Statistics>,
+    /// What the recorder has written and dropped, once it has closed the file.
+    recorder: Option<v1::RecordingCounts>,
     has_ended: bool,
+}
+
+/// A number of messages that was read of a topic, and the number that should have been.
+struct Missing {
+    topic: String,
+    read: u64,
+    stated: u64,
 }
 
 impl RecordCounts {
@@ -28,14 +39,17 @@ impl RecordCounts {
         }
     }
 
-    /// Ends the counting. The file's own counts can be used from here on, if they are `sound`.
-    pub(super) fn end(&mut self, are_sound: bool) {
-        self.has_ended = true;
-        self.stated = self.stated.take().filter(|_| are_sound);
+    /// Adds counts of the recorder; only the last ones, of the closed file, are complete.
+    pub(super) fn add_recorder(&mut self, counts: v1::RecordingCounts) {
+        self.recorder = Some(counts).filter(|counts| counts.closed);
     }
 
-    fn stated(&self) -> Option<&Statistics> {
-        self.stated.as_ref().filter(|_| self.has_ended)
+    /// Ends the counting. The counts of the summary can be used from here on, if they are `sound`; those of the
+    /// recorder unless a repaired file has them of the file before.
+    pub(super) fn end(&mut self, are_sound: bool, is_repaired: bool) {
+        self.has_ended = true;
+        self.stated = self.stated.take().filter(|_| are_sound);
+        self.recorder = self.recorder.take().filter(|_| !is_repaired);
     }
 
     /// True if a message of this channel was read.
@@ -43,40 +57,64 @@ impl RecordCounts {
         self.messages.contains_key(&channel_id)
     }
 
-    /// Number of messages by the file's own count, if it can be trusted; `None` before the end.
-    pub(super) fn stated_messages(&self) -> Option<u64> {
-        self.stated().map(|stated| stated.message_count)
+    /// True if the recorder has dropped messages.
+    pub(super) fn has_dropped(&self) -> bool {
+        self.recorder.iter().flat_map(|counts| &counts.topics).any(|topic| topic.dropped > 0)
     }
 
-    /// Number of messages that the file lacks by its own count, if that can be trusted; 0 before the end.
-    pub(super) fn missing_messages(&self) -> u64 {
-        self.stated_messages().map_or(0, |stated| stated.saturating_sub(self.messages.values().sum()))
+    /// The topics of which more or fewer messages were read than the file states; `None` if it does not state it.
+    fn differing(&self, topic: impl Fn(u16) -> String) -> Option<Vec<Missing>> {
+        let mut read: BTreeMap<String, u64> = BTreeMap::new();
+        self.messages.iter().for_each(|(id, count)| *read.entry(topic(*id)).or_default() += count);
+        let mut stated: BTreeMap<String, u64> = BTreeMap::new();
+        let of_recorder = self.recorder.iter().flat_map(|counts| &counts.topics);
+        stated.extend(of_recorder.map(|count| (count.topic.clone(), count.written)));
+        if let Some(of) = &self.stated {
+            let mut of_summary: BTreeMap<String, u64> = BTreeMap::new();
+            let by_channel = of.channel_message_counts.iter();
+            by_channel.for_each(|(id, count)| *of_summary.entry(topic(*id)).or_default() += count);
+            of_summary.into_iter().for_each(|(topic, count)| _ = stated.entry(topic).or_insert(count));
+        }
+        if !self.has_ended || (self.recorder.is_none() && self.stated.is_none()) {
+            return None;
+        }
+        let differing = stated.into_iter().map(|(topic, stated)| {
+            let read = read.get(&topic).copied().unwrap_or_default();
+            Missing { topic, read, stated }
+        });
+        Some(differing.filter(|of| of.read != of.stated).collect())
+    }
+
+    /// Number of messages that the file lacks by its own counts; `None` before the end, or without counts that can be
+    /// trusted.
+    pub(super) fn missing_messages(&self, topic: impl Fn(u16) -> String) -> Option<u64> {
+        let differing = self.differing(topic)?;
+        Some(differing.iter().map(|of| of.stated.saturating_sub(of.read)).sum())
     }
 
     /// True if the file states its counts and has no message, attachment or metadata less.
-    pub(super) fn are_all_there(&self) -> bool {
-        self.stated().is_some_and(|stated| {
-            let messages = self.messages.values().sum::<u64>() >= stated.message_count;
-            messages && self.attachments >= stated.attachment_count && self.metadata >= stated.metadata_count
-        })
+    pub(super) fn are_all_there(&self, topic: impl Fn(u16) -> String) -> bool {
+        let has_others = self.stated.as_ref().is_some_and(|stated| {
+            self.attachments >= stated.attachment_count && self.metadata >= stated.metadata_count
+        });
+        has_others && self.missing_messages(topic) == Some(0)
     }
 
-    /// What is wrong with the number of messages, if the damaged parts of the file name this many lost ones; `None`
-    /// without a damaged part.
-    pub(super) fn fault(&self, named: Option<u64>, topic: impl Fn(u16) -> String) -> Option<String> {
-        let stated = self.stated()?;
-        let read: u64 = self.messages.values().sum();
-        if read > stated.message_count || (named.is_none() && read < stated.message_count) {
-            return Some(format!("has {}, and {} by its own count", counted(read, "message"), stated.message_count));
-        }
-        let read_of = |id| self.messages.get(id).copied().unwrap_or_default();
-        let by_channel = stated.channel_message_counts.iter();
-        let lost = by_channel.map(|(id, stated)| (*id, stated.saturating_sub(read_of(id))));
-        let lost: BTreeMap<u16, u64> = lost.filter(|(_, lost)| *lost > 0).collect();
+    /// What is wrong with the numbers of messages, if the damaged parts of the file name this many lost ones.
+    pub(super) fn faults(&self, named: u64, topic: impl Fn(u16) -> String) -> Vec<String> {
+        let differing = self.differing(topic).unwrap_or_default();
+        let more = differing.iter().filter(|of| of.read > of.stated);
+        let mut faults: Vec<String> = more
+            .map(|of| {
+                format!("has {} of {}, and {} by its own count", counted(of.read, "message"), of.topic, of.stated)
+            })
+            .collect();
+        let lost: Vec<_> = differing.iter().filter(|of| of.read < of.stated).collect();
         // Damage over several chunks may have destroyed an index that counts their messages.
-        (named? < lost.values().sum()).then(|| {
-            let lost = lost.iter().map(|(id, lost)| format!("{} of {}", counted(*lost, "message"), topic(*id)));
-            format!("lost in all, by its own count: {}", lost.collect::<Vec<_>>().join(", "))
-        })
+        if named < lost.iter().map(|of| of.stated - of.read).sum() {
+            let lost = lost.iter().map(|of| format!("{} of {}", counted(of.stated - of.read, "message"), of.topic));
+            faults.push(format!("lost in all, by its own count: {}", lost.collect::<Vec<_>>().join(", ")));
+        }
+        faults
     }
 }

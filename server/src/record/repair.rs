@@ -151,7 +151,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
                 }
                 None => Ok(()),
             },
-            Record::Metadata(metadata) => writer.write_metadata(&reader.with_known_format(metadata)),
+            Record::Metadata(metadata) => writer.write_metadata(&reader.header().with_known_format(metadata)),
             Record::Attachment { header, data, .. } => {
                 let AttachmentHeader { log_time, create_time, name, media_type } = header;
                 writer.attach(&Attachment { log_time, create_time, name, media_type, data })
@@ -160,8 +160,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
         };
         copied.map_err(failed)?;
     }
-    report.lost_messages = reader.counts().stated_messages().map(|_| reader.missing_messages());
-    report.has_all_records = reader.counts().are_all_there();
+    (report.lost_messages, report.has_all_records) = (reader.lost_messages(), reader.has_all_records());
     (report.damages, report.incomplete) = (reader.damages(), reader.incomplete());
     if report.messages == 0 {
         return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });

@@ -3,10 +3,10 @@
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
 //! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one.
 //! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which
-//! the file lacks are counted as unjudged: those after a gap, until the next keyframe. An event or a map that is not in
-//! its place says that the file has changed, not that a map differs.
+//! the file lacks are counted as unjudged: those after a gap, until the next keyframe; and if messages of the file are
+//! missing or not in their place, all recorded maps without a computed one, and the reverse.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -19,7 +19,6 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::base::counted::counted;
 use crate::config::RecordedMaps;
 use crate::encode::{EncodedMap, as_served, as_served_with};
 use crate::record::damage::Damage;
@@ -27,14 +26,11 @@ use crate::record::mcap_file::sha256;
 use crate::record::reader::{Beginning, RecordedMessage, RecordingError, RecordingReader};
 
 mod difference;
-mod disorder;
 
 use difference::first_difference;
 pub use difference::{Difference, DifferenceKind};
-pub use disorder::Disorder;
 
-/// Greatest number of differences, and of places out of order, in a report; all are counted. Ours: the first ones
-/// explain the others.
+/// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
 const DIFFERENCES_MAX: usize = 20;
 
 /// The result of a verification.
@@ -74,10 +70,6 @@ pub struct Report {
     pub differences: Vec<Difference>,
     /// Number of all differences.
     pub different: u64,
-    /// The first events and maps that do not stand in their place: behind a gap, behind a later one, or twice.
-    pub disorder: Vec<Disorder>,
-    /// Number of all of these.
-    pub disordered: u64,
 }
 
 /// A recording cannot be verified.
@@ -109,7 +101,6 @@ impl Report {
             "dropped": self.dropped, "dropped_because": self.dropped_because,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(), "repaired": self.repaired,
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
-            "disorder": self.disorder.iter().map(Disorder::to_json).collect::<Vec<_>>(), "disordered": self.disordered,
         })
     }
 
@@ -118,21 +109,6 @@ impl Report {
         if self.differences.len() < DIFFERENCES_MAX {
             self.differences.push(Difference { vehicle: vehicle.into(), sequence, layer: layer.into(), kind });
         }
-    }
-
-    fn add_disorder(&mut self, disorder: Disorder) {
-        self.disordered += 1;
-        if self.disorder.len() < DIFFERENCES_MAX {
-            self.disorder.push(disorder);
-        }
-    }
-
-    /// How the file is incomplete by its order alone. What the recorder has dropped, or what a repair could not read,
-    /// leaves a gap that is told already.
-    fn why_disordered(&self) -> Option<String> {
-        let first = self.disorder.first().filter(|_| self.dropped == 0 && self.repaired.is_empty())?;
-        let places = counted(self.disordered, "place");
-        Some(format!("its messages are not as they were written in {places}, the first: {first}"))
     }
 }
 
@@ -148,18 +124,14 @@ struct VehicleReplay {
     warm_up: Option<Pipeline>,
     valid_ms: u32,
     records: RecordedMaps,
-    /// Sequence of the next event of the maps; `None` before the first one.
+    /// Sequence of the next event; `None` before the first one.
     next_event: Option<u64>,
-    /// Sequence of the event that follows the newest one of the file, which may be an earlier one.
-    next_of_file: Option<u64>,
-    /// True while a keyframe repeats the events that are in force.
-    repeats: bool,
-    /// Sequence of the newest map that was compared, by layer.
-    newest_maps: BTreeMap<String, u64>,
     /// True if events are missing before this one, until the next keyframe; the maps need not equal the computed ones.
     lacks_events: bool,
     /// Computed maps that are not compared yet, by sequence and layer.
     computed: BTreeMap<(u64, String), Bytes>,
+    /// Recorded maps without a computed one, by sequence and layer.
+    extra: BTreeSet<(u64, String)>,
 }
 
 /// Verifies a recording. A map that differs and a damaged part are no errors; the [`Report`] contains them.
@@ -187,11 +159,9 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             valid_ms: vehicle.maps.valid_ms,
             records: recording.maps(),
             next_event: is_first_part.then_some(0),
-            next_of_file: is_first_part.then_some(0),
-            repeats: false,
-            newest_maps: BTreeMap::new(),
             lacks_events: false,
             computed: BTreeMap::new(),
+            extra: BTreeSet::new(),
         });
     }
     let mut report = Report { recorded: recording.maps(), ..Report::default() };
@@ -209,7 +179,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             RecordedMessage::Event { vehicle, event } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
                 report.events += 1;
-                replay.step(&event, boot_id, &mut report, recording.loss_count() > 0);
+                replay.step(&event, boot_id, &mut report);
             }
             RecordedMessage::Keyframe { vehicle, keyframe } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
@@ -248,23 +218,15 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
         let differs = format!("its metadata has the boot id {stated_boot_id}, and its maps have {boot_id}");
         report.incomplete.get_or_insert(differs);
     }
-    if let Some(disorder) = report.why_disordered() {
-        report.incomplete.get_or_insert(disorder);
+    let mut has_changed = recording.lacks_messages() || recording.loss_count() > 0;
+    // After a gap the maps that are computed have other numbers than the recorded ones.
+    let is_early = |replay: &VehicleReplay| replay.extra.iter().any(|map| replay.computed.contains_key(map));
+    if !has_changed && replays.iter().any(is_early) {
+        has_changed = true;
+        report.incomplete.get_or_insert("a map stands before its events, so the file was changed".into());
     }
-    // Then the messages were written, and something else has changed the file later.
-    let has_changed = recording.missing_messages() > 0 || recording.loss_count() > 0 || report.disordered > 0;
     for replay in &replays {
-        // The recorder writes an event before its map, so a cut can remove only the map of the last event.
-        let tail = replay.computed.last_key_value().map(|((sequence, _), _)| *sequence);
-        for (sequence, layer) in replay.computed.keys() {
-            if report.cut && Some(*sequence) == tail {
-                report.beyond_cut += 1;
-            } else if replay.lacks_events || has_changed {
-                report.unjudged += 1;
-            } else {
-                report.add(&replay.name, *sequence, layer, DifferenceKind::Missing);
-            }
-        }
+        replay.end(has_changed || report.dropped > 0, &mut report);
     }
     Ok(report)
 }
@@ -276,8 +238,6 @@ impl VehicleReplay {
             v1::KeyframePhase::WarmUp => {
                 self.warm_up = Some(Pipeline::new(&self.config, self.tables.clone())?);
                 self.next_event.get_or_insert(keyframe.first_event);
-                self.next_of_file.get_or_insert(keyframe.first_event);
-                self.repeats = true;
             }
             v1::KeyframePhase::Begin => {
                 if let Some(mut pipeline) = self.warm_up.take() {
@@ -291,24 +251,15 @@ impl VehicleReplay {
         Ok(())
     }
 
-    /// Steps the pipelines with an event and keeps the map that it completes. Events that are missing in a damaged file
-    /// are no difference: the damage is reported.
-    fn step(&mut self, event: &Event, boot_id: u64, report: &mut Report, is_damaged: bool) {
+    /// Steps the pipelines with an event and keeps the map that it completes. The reader of the file reports missing
+    /// events.
+    fn step(&mut self, event: &Event, boot_id: u64, report: &mut Report) {
         if let Some(warm_up) = &mut self.warm_up {
             // Refused as it was in the recorded run.
             let _ = warm_up.step(event);
         }
         let expected = self.next_event.unwrap_or(event.sequence);
-        self.repeats &= event.sequence < expected;
-        if self.repeats {
-            return;
-        }
-        let place = self.next_of_file.replace(event.sequence.saturating_add(1)).unwrap_or(event.sequence);
-        if event.sequence != place && !(is_damaged && self.lacks_events) {
-            let (vehicle, found) = (self.name.to_string(), event.sequence);
-            report.add_disorder(Disorder::Event { vehicle, expected: place, found });
-        }
-        // One that was processed before.
+        // An event that is repeated for a keyframe was processed before.
         if event.sequence < expected {
             return;
         }
@@ -327,28 +278,17 @@ impl VehicleReplay {
         }
     }
 
-    /// The computed layer of this sequence, if there is one; `None` for a map that is in the file again.
-    fn computed_of(&mut self, layer: &str, sequence: u64, report: &mut Report) -> Option<Option<Bytes>> {
-        let computed = self.computed.remove(&(sequence, layer.to_owned()));
-        if computed.is_some() {
-            self.newest_maps.insert(layer.to_owned(), sequence);
-        } else if self.newest_maps.get(layer).is_some_and(|newest| sequence <= *newest) {
-            let (vehicle, layer) = (self.name.to_string(), layer.to_owned());
-            report.add_disorder(Disorder::Map { vehicle, layer, sequence });
-            return None;
-        }
-        Some(computed)
-    }
-
     /// Compares a recorded layer with the computed one.
     fn compare(&mut self, layer: &str, bytes: &Bytes, report: &mut Report) {
         let (sequence, cells) = sequence_and_cells(bytes);
-        let Some(computed) = self.computed_of(layer, sequence, report) else { return };
+        let computed = self.computed.remove(&(sequence, layer.to_owned()));
         report.cells += if computed.is_some() { cells } else { 0 };
         match computed.map(|computed| as_served(computed, bytes)) {
             Some(computed) if computed == *bytes => report.equal += 1,
-            _ if self.lacks_events || self.pipeline.is_none() => report.unjudged += 1,
-            None => report.add(&self.name, sequence, layer, DifferenceKind::Extra),
+            _ if self.lacks_events || self.pipeline.is_none() || self.records == RecordedMaps::None => {
+                report.unjudged += 1;
+            }
+            None => _ = self.extra.insert((sequence, layer.to_owned())),
             Some(computed) => report.add(&self.name, sequence, layer, first_difference(bytes, &computed)),
         }
     }
@@ -357,12 +297,14 @@ impl VehicleReplay {
     fn compare_digest(&mut self, layer: &str, digest: v1::MapDigest, report: &mut Report) {
         let v1::MapDigest { header, sha256: recorded } = digest;
         let sequence = header.as_ref().map_or(u64::MAX, |header| header.sequence);
-        let Some(computed) = self.computed_of(layer, sequence, report) else { return };
+        let computed = self.computed.remove(&(sequence, layer.to_owned()));
         report.cells += computed.as_ref().map_or(0, |computed| sequence_and_cells(computed).1);
         match computed.map(|computed| sha256(&as_served_with(computed, header))) {
             Some(computed) if computed == recorded => report.equal += 1,
-            _ if self.lacks_events || self.pipeline.is_none() => report.unjudged += 1,
-            None => report.add(&self.name, sequence, layer, DifferenceKind::Extra),
+            _ if self.lacks_events || self.pipeline.is_none() || self.records == RecordedMaps::None => {
+                report.unjudged += 1;
+            }
+            None => _ = self.extra.insert((sequence, layer.to_owned())),
             Some(computed) => {
                 let hex = |bytes: &Bytes| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
                 let (recorded, computed) = (hex(&recorded), hex(&computed));
@@ -372,6 +314,28 @@ impl VehicleReplay {
                     layer,
                     DifferenceKind::Field { field: "sha256".into(), recorded, computed },
                 );
+            }
+        }
+    }
+
+    /// Judges the maps that are only recorded or only computed. They are no differences if the file `lacks_messages`.
+    fn end(&self, lacks_messages: bool, report: &mut Report) {
+        let is_unjudged = self.lacks_events || lacks_messages;
+        for (sequence, layer) in &self.extra {
+            match is_unjudged {
+                true => report.unjudged += 1,
+                false => report.add(&self.name, *sequence, layer, DifferenceKind::Extra),
+            }
+        }
+        // The recorder writes an event before its map, so a cut can remove only the map of the last event.
+        let tail = self.computed.last_key_value().map(|((sequence, _), _)| *sequence);
+        for (sequence, layer) in self.computed.keys() {
+            if report.cut && Some(*sequence) == tail {
+                report.beyond_cut += 1;
+            } else if is_unjudged {
+                report.unjudged += 1;
+            } else {
+                report.add(&self.name, *sequence, layer, DifferenceKind::Missing);
             }
         }
     }

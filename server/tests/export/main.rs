@@ -258,6 +258,8 @@ const CONFIG: &str = "[[vehicle]]\nname = 'alpha'\nqueue = 16\n[[vehicle.sensor]
 /// the server records them. Returns the number of bytes of each revolution's points.
 fn record_drive(path: &Path) -> Vec<usize> {
     let mut writer = mcap::WriteOptions::new().compression_threads(0).create(File::create(path).unwrap()).unwrap();
+    let metadata = BTreeMap::from([("boot_id".to_string(), "7".to_string())]);
+    writer.write_metadata(&mcap::records::Metadata { name: "clearway".into(), metadata }).unwrap();
     let (name, data) = ("config.toml".to_owned(), CONFIG.as_bytes().into());
     let media_type = "application/toml".to_owned();
     writer.attach(&mcap::Attachment { log_time: 0, create_time: 0, name, media_type, data }).unwrap();
@@ -277,14 +279,14 @@ fn record_drive(path: &Path) -> Vec<usize> {
         };
         writer.write_to_known_channel(&header, bytes).unwrap();
     };
+    let mut next = 0;
     let mut event = |arrival_ns: i64, body: v1::event::Body| {
-        let event = v1::Event { arrival_ns, body: Some(body), ..Default::default() };
+        let event = v1::Event { sequence: next, arrival_ns, body: Some(body), ..Default::default() };
+        next += 1;
         put(journal, arrival_ns, &event.encode_to_vec());
     };
     let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
     let (mut revolutions, mut last_ns) = (Vec::new(), 0);
-    // An event of a sensor that the configuration does not have.
-    let stray = v1::Event { source: 3, body: Some(v1::event::Body::End(v1::End {})), ..Default::default() };
     for datagram in SimulatedVehicle::new(flat(), ScannerConfig::default()).take(1200) {
         if let Ok(Some(revolution)) = sensor.push(&datagram.payload, datagram.stamp_ns) {
             revolutions.push(12 * revolution.returns());
@@ -294,6 +296,9 @@ fn record_drive(path: &Path) -> Vec<usize> {
     }
     revolutions.extend(sensor.finish().map(|revolution| 12 * revolution.returns()));
     event(last_ns, v1::event::Body::End(v1::End {}));
+    // An event of a sensor that the configuration does not have.
+    let stray =
+        v1::Event { sequence: next, source: 3, body: Some(v1::event::Body::End(v1::End {})), ..Default::default() };
     put(journal, last_ns, &stray.encode_to_vec());
     for sequence in 0..3 {
         let end_ns = CAPTURE_END_NS + 100_000_000 * sequence;

@@ -187,8 +187,8 @@ impl Recorded {
         if let Some(difference) = wrong {
             return Err(violation("recording", format!("part {part}, lost {}: {difference}", self.lost)));
         }
-        if let Some(disorder) = report.disorder.first().filter(|_| self.lost == 0) {
-            return Err(violation("recording", format!("part {part}: {disorder}")));
+        if let Some(incomplete) = report.incomplete.as_ref().filter(|_| self.lost == 0 && file.is_complete) {
+            return Err(violation("recording", format!("part {part}: {incomplete}")));
         }
         if file.is_complete && (report.cut || !report.is_closed) {
             return Err(violation("recording", format!("part {part} has its name and is not whole")));

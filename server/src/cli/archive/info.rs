@@ -20,7 +20,7 @@ use serde_json::{Map, Value, json};
 use crate::base::file_advice::open_to_read;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
-use crate::cli::shared::output::{counted, print_line};
+use crate::cli::shared::output::{counted, print_line, printable};
 use crate::encode::event_from_bytes;
 use crate::ingest::files::{Kind, kind};
 use crate::record::mcap_reader::{McapReader, Message};
@@ -62,7 +62,8 @@ pub fn run(options: &Options) -> Result<Exit> {
     }
     let is_incomplete = document["complete"] == false;
     if is_incomplete {
-        eprintln!("clearway: {} is not whole: {}", file.display(), document["state"].as_str().unwrap_or_default());
+        let state = printable(document["state"].as_str().unwrap_or_default());
+        eprintln!("clearway: {} is not whole: {state}", file.display());
     }
     Ok(Exit::from_incomplete(is_incomplete))
 }

@@ -8,7 +8,7 @@ use futures::StreamExt;
 
 use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::client::screen::Screen;
-use crate::cli::shared::output::{block_on, counted, stop_signal};
+use crate::cli::shared::output::{self, block_on, counted, stop_signal};
 
 /// Show the vehicles of a server live: state, age, rate, loss, latency, readers, and what is wrong.
 ///
@@ -122,8 +122,9 @@ fn age(ms: f64) -> String {
     }
 }
 
+/// The text on one line.
 fn printable(text: &str) -> String {
-    text.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
+    output::printable(text).replace(['\n', '\t'], "\u{fffd}")
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Paths of the command line -> open files, or errors that name the file, what is wrong and what to do.
 
 use std::fs::{self, File};
-use std::io::Error;
+use std::io::{Error, Write as _};
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
@@ -57,6 +57,14 @@ pub fn create_folder(folder: &Path) -> Result<()> {
         bail!("{}: this is a file; name a folder", folder.display());
     }
     fs::create_dir_all(folder).map_err(|error| wrong(folder, error))
+}
+
+/// Writes a file that does not exist yet.
+///
+/// # Errors
+/// If it exists or cannot be written.
+pub fn write_new(file: &Path, bytes: &[u8]) -> Result<()> {
+    create_new(file)?.write_all(bytes).map_err(|error| wrong(file, error))
 }
 
 /// Writes a file; one that exists is replaced.

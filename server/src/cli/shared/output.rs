@@ -22,13 +22,19 @@ pub fn with_causes(error: &Error) -> String {
     text
 }
 
-/// Prints `text` on stdout. `false` if the reader of stdout has closed it (`| head`), which is no error.
+/// The text without the control characters that would command a terminal; a file may have brought them.
+pub fn printable(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() && !matches!(c, '\n' | '\t') { '\u{fffd}' } else { c }).collect()
+}
+
+/// Prints `text` on stdout, as [`printable`] has it. `false` if the reader of stdout has closed it (`| head`), which is
+/// no error.
 ///
 /// # Errors
 /// If stdout cannot be written, such as a file on a full disk.
 pub fn print(text: &str) -> Result<bool> {
     let mut stdout = std::io::stdout();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(printable(text).as_bytes()).and_then(|()| stdout.flush()) {
         Ok(()) => Ok(true),
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
         Err(error) => Err(error).context("write to stdout"),

@@ -4,9 +4,10 @@ use std::fs::File;
 use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::Path;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
+use crate::cli::shared::files;
 use crate::encode::picture::Picture;
 
 /// Place of the width and the height in a GIF.
@@ -34,7 +35,7 @@ impl Gif {
     /// # Errors
     /// If it exists or cannot be created.
     pub fn create(path: &Path) -> Result<Self> {
-        let file = File::create_new(path).with_context(|| format!("write {}", path.display()))?;
+        let file = files::create_new(path)?;
         let mut encoder = Encoder::new(BufWriter::new(file), 0, 0, &[])?;
         encoder.set_repeat(Repeat::Infinite)?;
         Ok(Self { encoder, size: (0, 0), newest: None })

@@ -249,7 +249,7 @@ pub fn run(options: &Options) -> Result<Exit> {
     }
     let incomplete = recording.incomplete();
     if let Some(incomplete) = &incomplete {
-        eprintln!("clearway: {} is {incomplete}; the maps of the rest are exported", file.display());
+        eprintln!("clearway: {} is not whole: {incomplete}; the maps of the rest are exported", file.display());
     }
     if maps.is_empty() {
         bail!("{}", nothing_exported(file, &recording, None, vehicle.as_deref()));
@@ -319,7 +319,7 @@ fn nothing_exported(file: &Path, recording: &McapReader, layer: Option<&str>, ve
 fn write(stem: &str, encoded: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> {
     encoded.into_iter().try_for_each(|(ending, bytes)| {
         let path = out.join(format!("{stem}{ending}"));
-        files::write(&path, &bytes)
+        files::write_new(&path, &bytes)
     })
 }
 

@@ -20,7 +20,7 @@ use self::checked::{Check, Checked, NewConfig};
 use self::files::Shard;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files as one_file;
-use crate::cli::shared::output::{print, print_line};
+use crate::cli::shared::output::{print, print_line, printable};
 
 mod checked;
 mod files;
@@ -130,7 +130,7 @@ pub fn run(options: &Options) -> Result<Exit> {
     }
     let reasons: Vec<&String> = results.iter().filter_map(Checked::not_checked).collect();
     let different: BTreeSet<&String> = reasons.iter().copied().collect();
-    different.iter().for_each(|reason| eprintln!("clearway: {reason}"));
+    different.iter().for_each(|reason| eprintln!("clearway: {}", printable(reason)));
     // One mistake of the command line: the table would say nothing but the same.
     let is_one_mistake = different.len() == 1 && reasons.len() == results.len();
     if options.json {

@@ -21,7 +21,7 @@ pub fn draw(result: &mut Checked, folder: &Path) -> Result<()> {
     let stem = stem(&result.file);
     for map in &comparison.worst {
         let file = folder.join(format!("{stem}_{:06}_{}_{}.png", map.sequence, map.vehicle, map.after.name));
-        files::write(&file, &before_after_change(map)?.to_png()?)?;
+        files::write_new(&file, &before_after_change(map)?.to_png()?)?;
         result.pictures.push(file);
     }
     Ok(())

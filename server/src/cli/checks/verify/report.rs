@@ -14,6 +14,9 @@ use crate::cli::shared::output::counted;
 use crate::config::RecordedMaps;
 use crate::record::compare::{Comparison, LayerChange, MapChange};
 
+/// The beginning of every report.
+const XML: &str = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites name=\"clearway verify\"";
+
 /// The result of one file in one line: `equal`, the first difference, or why it cannot be read.
 pub fn reason(outcome: &Outcome) -> String {
     match outcome {
@@ -131,20 +134,21 @@ fn comparison_json(comparison: &Comparison) -> Value {
     })
 }
 
-/// Refuses to replace a file that is no XML.
+/// Refuses to replace a file that is no report.
 ///
 /// # Errors
-/// If it exists and is neither empty nor XML.
+/// If it exists and is neither empty nor an earlier report.
 pub fn check_junit(file: &Path) -> Result<()> {
     if !file.is_file() {
         return Ok(());
     }
     let mut start = Vec::new();
     File::open(file)
-        .and_then(|open| open.take(5).read_to_end(&mut start))
+        .and_then(|open| open.take(XML.len() as u64).read_to_end(&mut start))
         .with_context(|| file.display().to_string())?;
-    if !start.is_empty() && start != b"<?xml" {
-        bail!("--junit {}: the file exists and is no XML, so it is not replaced; name another file", file.display());
+    if !start.is_empty() && start != XML.as_bytes() {
+        let file = file.display();
+        bail!("--junit {file}: the file exists and is not an earlier report, so it is not replaced; name another file");
     }
     Ok(())
 }
@@ -157,13 +161,10 @@ pub fn junit(results: &[Checked]) -> String {
     let failures = count(|result| result.exit() == Exit::Differs);
     // `sum` of nothing is -0.
     let seconds = results.iter().fold(0.0, |seconds, result| seconds + result.seconds);
-    let sums = format!(
-        "name=\"clearway verify\" tests=\"{}\" failures=\"{failures}\" errors=\"{errors}\" time=\"{seconds:.3}\"",
-        results.len()
-    );
-    let mut xml = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n".to_owned();
+    let sums = format!("tests=\"{}\" failures=\"{failures}\" errors=\"{errors}\" time=\"{seconds:.3}\"", results.len());
+    let mut xml = XML.to_owned();
     // Writing to a string cannot fail.
-    let _ = writeln!(xml, "<testsuites {sums}>\n  <testsuite {sums}>");
+    let _ = writeln!(xml, " {sums}>\n  <testsuite name=\"clearway verify\" {sums}>");
     for result in results {
         let name = escaped(&result.file.display().to_string());
         let _ =

@@ -228,8 +228,8 @@ pub enum ReplayError {
         /// The file.
         file: PathBuf,
     },
-    /// The recording would replace the file of another option.
-    #[error("--record {}: this is the file of {option}; name another file", file.display())]
+    /// The recording would replace the file of another option, or is written to it meanwhile.
+    #[error("--record {}: this is the file of {option}, or written under its name; name another file", file.display())]
     RecordOfOption {
         /// The file.
         file: PathBuf,

@@ -33,9 +33,12 @@ impl ReadyFile {
             return Err(other());
         }
         let text = std::fs::read(file).map_err(wrong)?;
-        let has_pid = || serde_json::from_slice::<Value>(&text).is_ok_and(|document| document.get("pid").is_some());
-        if !text.is_empty() && !has_pid() {
-            return Err(other());
+        if !text.is_empty() {
+            let pid = pid_of(&text).ok_or_else(other)?;
+            if Path::new("/proc").join(pid.to_string()).exists() {
+                let advice = format!("the file is that of process {pid}, which still runs; name another file");
+                return Err(wrong(Error::new(ErrorKind::AlreadyExists, advice)));
+            }
         }
         std::fs::remove_file(file).map_err(wrong)
     }
@@ -62,6 +65,13 @@ impl ReadyFile {
         std::fs::rename(&unfinished, file).map_err(wrong)?;
         Ok(Self(file.to_owned()))
     }
+}
+
+/// The process that has written this text, if it is that of a replay.
+fn pid_of(text: &[u8]) -> Option<u64> {
+    let document: Value = serde_json::from_slice(text).ok()?;
+    let is_ours = ["grpc", "page", "zenoh", "foxglove", "vehicles"].iter().all(|key| document.get(key).is_some());
+    document.get("pid")?.as_u64().filter(|_| is_ours)
 }
 
 impl Drop for ReadyFile {

@@ -30,9 +30,9 @@ pub(super) fn check_record(options: &Options, record: &Path) -> Result<(), Repla
         ("--fault-script", &options.fault_script),
         ("--ready-file", &options.ready_file),
     ];
-    if let Some((option, _)) =
-        others.into_iter().find(|(_, file)| file.as_deref().is_some_and(|file| is_one(file, record)))
-    {
+    let unfinished = unfinished_name(record);
+    let is_taken = |file: &Path| is_one(file, record) || is_one(file, &unfinished);
+    if let Some((option, _)) = others.into_iter().find(|(_, file)| file.as_deref().is_some_and(is_taken)) {
         return Err(ReplayError::RecordOfOption { file: record.to_owned(), option });
     }
     let is_folder = record.as_os_str().as_encoded_bytes().ends_with(b"/");
@@ -51,7 +51,6 @@ pub(super) fn check_record(options: &Options, record: &Path) -> Result<(), Repla
         return Err(ReplayError::RecordLink { file: record.to_owned() });
     }
     // After a crash it is all that is left of a recording.
-    let unfinished = unfinished_name(record);
     if unfinished.symlink_metadata().is_ok() {
         return Err(ReplayError::RecordUnfinished { file: record.to_owned(), unfinished });
     }
