@@ -269,7 +269,7 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
 
 /// How a recording that was read to its end is incomplete, with its name.
 fn incomplete(file: &Path, recording: &RecordingReader) -> Option<String> {
-    recording.incomplete().map(|how| format!("{} is {how}", file.display()))
+    recording.incomplete().map(|how| format!("{} is not whole: {how}", file.display()))
 }
 
 /// The sides of a comparison, as indices.

@@ -36,7 +36,7 @@ pub(super) fn schemas_and_channels(file: &Path) -> io::Result<Vec<Record<'static
     file.seek(SeekFrom::Start(from))?;
     let mut tail = Vec::new();
     file.take(footer_at - from).read_to_end(&mut tail)?;
-    // The summary begins behind the end of the data. If a part of the file was cut out, the footer is wrong about where.
+    // The summary begins behind the end of the data. The footer is wrong about where, if a part was cut out.
     let ends = tail.windows(DATA_END.len()).rposition(|bytes| bytes == DATA_END);
     let Some(mut rest) = ends.and_then(|end| tail.get(end + DATA_END.len() + size_of::<u32>()..)) else {
         return Ok(Vec::new());
