@@ -93,11 +93,16 @@ impl Machines {
         Self { own, server: server_binary(server), folder, processes: BTreeMap::new(), hub: Hub::start() }
     }
 
-    /// Starts a command instead of the process of the same name.
-    pub fn start_command(&mut self, name: &str, command: &mut Command) -> &mut Process {
+    /// Adds a process, and ends the one of the same name.
+    pub fn add(&mut self, name: &str, process: Process) -> &mut Process {
         self.stop(&[name]);
-        let process = Process::start(command);
         self.processes.entry(name.into()).or_insert(process)
+    }
+
+    /// Starts a command instead of the process of the same name.
+    fn start_command(&mut self, name: &str, command: &mut Command) -> &mut Process {
+        self.stop(&[name]);
+        self.add(name, Process::start(command))
     }
 
     /// Starts a role of this binary instead of the process of the same name.

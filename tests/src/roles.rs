@@ -166,15 +166,15 @@ fn plain() -> [Vec<f32>; 3] {
     [list(&|angle, range_m| angle.cos() * range_m), list(&|angle, range_m| angle.sin() * range_m), list(&|_, _| -2.0)]
 }
 
-/// The points of a scan as [`plain`]: eight rings of rough ground, and walls here and there, another scan for each
-/// number.
+/// The points of a scan as [`plain`]: 32 rings of rough ground, and walls here and there, another scan for each number.
+/// Its maps of `speed` are as long as those of a recorded drive.
 fn rough(number: u64) -> [Vec<f32>; 3] {
     let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(number);
     let mut points: [Vec<f32>; 3] = Default::default();
-    for ray in 0..1440_u32 {
+    for ray in 0..5760_u32 {
         let (angle, ring) = (f64::from(2 * ray).to_radians(), f64::from(ray / 180));
-        let (range_m, z_m) = (3.0 + 3.0 * ring + random.random_range(0.0..1.0), random.random_range(0.0..0.1));
-        let is_wall = ray % 180 % 20 < 4;
+        let (range_m, z_m) = (3.0 + ring + random.random_range(0.0..1.0), random.random_range(0.0..0.1));
+        let is_wall = ring > 8.0 && ray % 180 % 20 < 4;
         let z_m = if is_wall { z_m - 1.0 } else { z_m - 2.0 };
         let point = [angle.cos() * range_m, angle.sin() * range_m, z_m];
         points.iter_mut().zip(point).for_each(|(list, value)| list.push(value as f32));
@@ -272,8 +272,13 @@ async fn age(endpoints: &str, vehicles: &str, layer: &str) {
 
 /// A stream of one layer from a server, with deltas.
 async fn subscribe_deltas(server: &str, vehicle: &str, layer: &str) -> MapStream {
-    let subscription =
-        Subscription { vehicle: vehicle.into(), layers: vec![layer.into()], deltas: true, ..Subscription::default() };
+    let subscription = Subscription {
+        vehicle: vehicle.into(),
+        layers: vec![layer.into()],
+        deltas: true,
+        max_in_flight: 1,
+        ..Subscription::default()
+    };
     loop {
         let Ok(client) = Client::connect(server).await else { continue };
         match client.subscribe(subscription.clone()).await {

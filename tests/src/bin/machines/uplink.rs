@@ -5,13 +5,15 @@
 //! at a router each, read one layer of both over zenoh; the planner `deltas`, on p2, reads v00 over gRPC with deltas. The
 //! counter of s1's interface says what the uplink carries, with all headers.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{ExitCode, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use clearway::config::Service;
+use clearway::store::upload;
 use clearway_tests::machines::{Machines, ROUTERS, command, sent_bytes};
 use clearway_tests::roles::{Process, server_config};
 
@@ -19,11 +21,13 @@ use crate::Arguments;
 
 const VEHICLE: &str = "v00";
 const OTHER: &str = "v01";
-const LAYER: &str = "drivability";
+const LAYER: &str = "speed";
 const S3: &str = "10.99.0.31:9000";
 const STORE: &str = "s3://fleet/kept";
 /// Longest wait for fresh maps, and for the store to have every part.
 const PATIENCE: Duration = Duration::from_secs(90);
+/// Time for which servers and readers have started before anything is measured.
+const SETTLED: Duration = Duration::from_secs(2);
 
 /// One line of a reader.
 struct Shown {
@@ -58,21 +62,23 @@ fn follow(reader: &'static str, process: &mut Process, seen: &Seen) {
     });
 }
 
-/// A row of the table: the rate of the uplink, 0 for none, and who reads.
+/// The rate of the uplink, 0 without a limit; what happens; and who reads.
+#[derive(Clone, Copy)]
 struct Phase {
     kbit_s: u32,
+    what: &'static str,
     readers: &'static [&'static str],
 }
 
 const PHASES: [Phase; 8] = [
-    Phase { kbit_s: 0, readers: &[] },
-    Phase { kbit_s: 1000, readers: &[] },
-    Phase { kbit_s: 1000, readers: &["p1"] },
-    Phase { kbit_s: 1000, readers: &["p1", "p2"] },
-    Phase { kbit_s: 200, readers: &["p1", "p2"] },
-    Phase { kbit_s: 1000, readers: &["p1", "p2"] },
-    Phase { kbit_s: 200, readers: &["deltas"] },
-    Phase { kbit_s: 1000, readers: &["deltas"] },
+    Phase { kbit_s: 0, what: "nobody reads", readers: &[] },
+    Phase { kbit_s: 1000, what: "nobody reads", readers: &[] },
+    Phase { kbit_s: 1000, what: "one reader", readers: &["p1"] },
+    Phase { kbit_s: 1000, what: "one at each router", readers: &["p1", "p2"] },
+    Phase { kbit_s: 200, what: "one at each router", readers: &["p1", "p2"] },
+    Phase { kbit_s: 1000, what: "repaired", readers: &["p1", "p2"] },
+    Phase { kbit_s: 200, what: "gRPC, deltas", readers: &["deltas"] },
+    Phase { kbit_s: 1000, what: "repaired", readers: &["deltas"] },
 ];
 
 struct Bed {
@@ -93,8 +99,9 @@ pub fn run(arguments: &Arguments) -> ExitCode {
         bed.machines.start_role(&format!("{machine} feed"), machine, "", &["feed", vehicle, "--rough"]);
     }
     println!(
-        "| uplink, kbit/s | reader | of | maps/s | kB a map | deltas, % | age, ms: median, most | fresh, % of the time \
-         | uplink carried, kbit/s | said |\n|---:|---|---|---:|---:|---:|---:|---:|---:|---|"
+        "| uplink, kbit/s (0: no limit) | what | reader, vehicle | fresh after, s | maps/s | kB a map | deltas, % \
+         | age, ms: median, most | fresh, % of the time | the uplink carried, kbit/s | said |\n\
+         |---:|---|---|---:|---:|---:|---:|---:|---:|---:|---|"
     );
     let length = Duration::from_secs_f64(arguments.seconds);
     let is_whole = PHASES.iter().all(|phase| bed.measure(phase, length)) && bed.record(length);
@@ -106,9 +113,10 @@ impl Bed {
         let mut config = server_config(&[vehicle.to_owned()], &ROUTERS.map(str::to_owned));
         config.vehicles[0].maps.valid_ms = self.valid_ms;
         config.grpc.listen = ([0, 0, 0, 0], 50051).into();
+        config.connections.unprotected = vec![Service::Grpc];
         if !recording.is_empty() {
             config.recorder.file = self.recording().join("car.mcap");
-            (config.recorder.part_s, config.recorder.save_s) = (2, 1);
+            (config.recorder.part_s, config.recorder.save_s, config.recorder.warm_up_ms) = (2, 1, 500);
             (config.store.url, config.store.delete) = (STORE.into(), true);
         }
         self.machines.start_server(machine, "", &config, recording);
@@ -120,11 +128,9 @@ impl Bed {
 
     /// Starts the readers that are missing, and ends the others.
     fn read(&mut self, readers: &[&'static str]) {
-        for (reader, machine, endpoints) in [
-            ("p1", "p1", ROUTERS[0]),
-            ("p2", "p2", ROUTERS[1]),
-            ("deltas", "p2", "grpc:10.99.0.11:50051"),
-        ] {
+        for (reader, machine, endpoints) in
+            [("p1", "p1", ROUTERS[0]), ("p2", "p2", ROUTERS[1]), ("deltas", "p2", "grpc:10.99.0.11:50051")]
+        {
             if !readers.contains(&reader) {
                 self.machines.stop(&[reader]);
             } else if !self.machines.processes.contains_key(reader) {
@@ -152,7 +158,7 @@ impl Bed {
         None
     }
 
-    /// Sets the rate and the readers, waits, and prints a row for each of their streams. Returns false if no map is
+    /// Sets the rate and the readers, waits, and prints a row for each of their streams. Returns false if no map becomes
     /// fresh.
     fn measure(&mut self, phase: &Phase, length: Duration) -> bool {
         let is_new = !phase.readers.iter().all(|reader| self.machines.processes.contains_key(*reader));
@@ -163,77 +169,81 @@ impl Bed {
             eprintln!("no fresh map after {PATIENCE:?}");
             return false;
         };
-        eprintln!("{} kbit/s, {:?}: fresh after {:.2} s", phase.kbit_s, phase.readers, fresh.as_secs_f64());
         // What travels while servers and readers start is not counted.
-        let from = if phase.readers.is_empty() || is_new {
-            std::thread::sleep(Duration::from_secs(2));
-            Instant::now()
-        } else {
-            began
-        };
-        let bytes = sent_bytes("s1");
-        std::thread::sleep(length.saturating_sub(from.elapsed()));
-        let carried = (sent_bytes("s1") - bytes) as f64 * 8e-3 / from.elapsed().as_secs_f64();
-        let rate = if phase.kbit_s == 0 { "no limit".to_owned() } else { phase.kbit_s.to_string() };
-        if phase.readers.is_empty() {
-            println!("| {rate} | nobody |  |  |  |  |  |  | {carried:.0} |  |");
+        if is_new || phase.readers.is_empty() {
+            std::thread::sleep(SETTLED);
         }
-        for ((reader, vehicle), lines) in &*self.seen.lock().expect("no panic") {
-            if phase.readers.contains(reader) {
-                println!("| {rate} | {reader} | {vehicle} | {} | {carried:.0} | {} |", figures(lines, from), said(lines, from));
-            }
-        }
+        self.print(phase, fresh, length);
         true
     }
 
-    /// Records, cuts the uplink while parts finish, repairs it, and prints what the store has.
+    /// Waits, and prints a row for each stream of the readers.
+    fn print(&self, phase: &Phase, fresh: Duration, length: Duration) {
+        let (from, bytes) = (Instant::now(), sent_bytes("s1"));
+        std::thread::sleep(length);
+        let carried = (sent_bytes("s1") - bytes) as f64 * 8e-3 / from.elapsed().as_secs_f64();
+        let (Phase { kbit_s, what, readers }, fresh) = (phase, fresh.as_secs_f64());
+        if readers.is_empty() {
+            println!("| {kbit_s} | {what} | | | | | | | | {carried:.0} | |");
+        }
+        let seen = self.seen.lock().expect("no panic");
+        for ((reader, vehicle), lines) in seen.iter().filter(|((reader, _), _)| readers.contains(reader)) {
+            let (figures, said) = (figures(lines, from), said(lines, from));
+            println!("| {kbit_s} | {what} | {reader}, {vehicle} | {fresh:.2} | {figures} | {carried:.0} | {said} |");
+        }
+    }
+
+    /// Records, cuts the uplink while parts finish, repairs it to a thin and then to a good one, and prints what the
+    /// store has. Returns false if a part is missing.
     fn record(&mut self, length: Duration) -> bool {
         std::fs::create_dir_all(self.recording()).expect("a folder of ours");
-        let script = clearway_tests::workspace().join("tests/python/s3_server.py");
-        let arguments = ["-B", script.to_str().expect("UTF-8"), S3];
-        let mut server = command("w1", "", &self.python, &arguments);
-        let url = line(self.machines.start_command("store", server.stdin(std::process::Stdio::piped())));
+        let url = self.start_store();
         let keys = [("AWS_ACCESS_KEY_ID", "test"), ("AWS_SECRET_ACCESS_KEY", "test"), ("AWS_REGION", "us-east-1")];
         let variables = [&[("AWS_ENDPOINT_URL", &*url)][..], &keys].concat();
         self.start_server("s1", VEHICLE, &variables);
-        self.read(&["p1"]);
-        if self.fresh(&["p1"], Instant::now()).is_none() {
+        let thin = Phase { kbit_s: 1000, what: "with the recording", readers: &["p1"] };
+        if !self.measure(&Phase { kbit_s: 0, ..thin }, length) {
             return false;
         }
-        std::thread::sleep(length);
         self.cut(1.0);
         let before = parts(&self.recording());
         std::thread::sleep(length);
         let after = parts(&self.recording());
-        let deleted = before.difference(&after).count();
-        let wanted: BTreeMap<_, _> = after.iter().map(|part| (part.clone(), crc(part))).collect();
+        let deleted = before.keys().filter(|part| !after.contains_key(*part)).count();
+        self.machines.limit("s1", thin.kbit_s);
         self.cut(0.0);
+        let is_fresh = self.measure(&thin, length);
+        self.machines.limit("s1", 0);
         let repaired = Instant::now();
-        let fresh = self.fresh(&["p1"], repaired);
-        // The newest of them may still be written.
-        let is_done = || parts(&self.recording()).is_disjoint(&after);
-        while !is_done() && repaired.elapsed() < PATIENCE {
+        while parts(&self.recording()).keys().any(|part| after.contains_key(part)) && repaired.elapsed() < PATIENCE {
             std::thread::sleep(Duration::from_millis(100));
         }
-        let caught_up = repaired.elapsed();
-        let verified = self.machines.run("w1", &["verify", STORE], &variables);
+        let caught_up = repaired.elapsed().as_secs_f64();
+        let verified = self.machines.run("w1", &["verify", STORE], &variables).status.code();
         let listed = self.machines.run("w1", &["recordings", "--store", STORE, "--json"], &variables);
         let listed = String::from_utf8_lossy(&listed.stdout).into_owned();
-        let stored = wanted.values().filter(|crc| listed.contains(&format!("-{crc:08x}.mcap"))).count();
+        let stored = after.values().filter(|crc| listed.contains(&format!("-{crc:08x}.mcap"))).count();
         println!(
-            "\n| parts on the disk when the uplink was cut | when it was repaired | deleted while it was cut | maps fresh \
-             after the repair, s | all parts of the cut confirmed, s | in the store by their CRC | `clearway verify` |\n\
-             |---:|---:|---:|---:|---:|---:|---:|\n| {} | {} | {deleted} | {:.2} | {:.1} | {stored} of {} | exit {:?} |",
+            "\n| parts that wait when the uplink is cut | when it is repaired | deleted between | all confirmed after the \
+             uplink is good, s | in the store by their CRC | `clearway verify` |\n|---:|---:|---:|---:|---:|---:|\n\
+             | {} | {} | {deleted} | {caught_up:.1} | {stored} of {} | exit {} |",
             before.len(),
             after.len(),
-            fresh.map_or(f64::INFINITY, |fresh| fresh.as_secs_f64()),
-            caught_up.as_secs_f64(),
-            wanted.len(),
-            verified.status.code()
+            after.len(),
+            verified.map_or("by signal".to_owned(), |code| code.to_string()),
         );
-        let lines = &self.seen.lock().expect("no panic")[&("p1", VEHICLE.to_owned())];
-        println!("\nMaps at p1 from the repair until then: | {} | {} |", figures(lines, repaired), said(lines, repaired));
-        true
+        is_fresh && stored == after.len() && verified == Some(0)
+    }
+
+    /// Starts the store; its URL. It ends when its standard input does.
+    fn start_store(&mut self) -> String {
+        let script = clearway_tests::workspace().join("tests/python/s3_server.py");
+        let mut server = command("w1", "", &self.python, &["-B", script.to_str().expect("UTF-8"), S3]);
+        let server = server.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null());
+        let process = self.machines.add("store", Process(server.spawn().expect("it starts")));
+        let mut line = String::new();
+        BufReader::new(process.0.stdout.take().expect("piped")).read_line(&mut line).expect("it lives");
+        line.trim().to_owned()
     }
 
     fn cut(&mut self, loss: f64) {
@@ -241,21 +251,15 @@ impl Bed {
     }
 }
 
-/// The first line that a process prints.
-fn line(process: &mut Process) -> String {
-    let mut line = String::new();
-    BufReader::new(process.0.stdout.take().expect("piped")).read_line(&mut line).expect("it lives");
-    line.trim().to_owned()
-}
-
-/// The parts of a recording on the disk.
-fn parts(folder: &Path) -> BTreeSet<PathBuf> {
+/// The finished parts of a recording on the disk that the store has not confirmed, with their CRCs.
+fn parts(folder: &Path) -> BTreeMap<PathBuf, u32> {
     let files = std::fs::read_dir(folder).expect("a folder of ours").flatten().map(|file| file.path());
-    files.filter(|file| file.extension().is_some_and(|extension| extension == "mcap")).collect()
-}
-
-fn crc(file: &Path) -> u32 {
-    std::fs::read(file).map_or(0, |bytes| crc32fast::hash(&bytes))
+    let parts = files.filter(|file| file.extension().is_some_and(|extension| extension == "mcap"));
+    let finished = parts.filter_map(|file| {
+        let bytes = std::fs::read(&file).ok().filter(|bytes| bytes.ends_with(&mcap::MAGIC))?;
+        Some((file, crc32fast::hash(&bytes)))
+    });
+    finished.filter(|(file, _)| !upload::is_confirmed(file)).collect()
 }
 
 /// Cells of the table from the lines of a stream since then: maps/s, kB a map, deltas, ages, the time it was fresh.
