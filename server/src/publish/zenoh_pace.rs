@@ -83,6 +83,8 @@ impl Probes {
         let query = self.session.get(&self.key).allowed_destination(Locality::Remote).timeout(ANSWER_TIMEOUT);
         // A full queue drops it, as it does maps; then it ends after the timeout.
         let query = query.priority(self.priority).congestion_control(CongestionControl::Drop);
+        // Express: in a batch with the map, which is received as one, it would arrive with the map.
+        let query = query.express(true);
         query.await.map(Probe).map_err(ZenohError::of(format!("probe {}", self.key)))
     }
 }
