@@ -96,7 +96,7 @@ fn stream(line: &str) -> Option<Stream<'_>> {
 )]
 fn a_thin_uplink_carries_what_somebody_takes_as_often_as_it_bears_and_loses_no_part_of_a_recording() {
     let python = fixture::venv::s3();
-    let arguments = ["--uplink", "--seconds", "2.5", "--valid-ms", "1000", "--python", python.to_str().unwrap()];
+    let arguments = ["--uplink", "--seconds", "2", "--valid-ms", "1000", "--python", python.to_str().unwrap()];
     let shown = machines(&arguments);
     let streams: Vec<_> = shown.lines().filter_map(stream).collect();
     let find = |kbit_s: &str, what: &str, of: &str| {
