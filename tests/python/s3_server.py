@@ -2,9 +2,10 @@
 
     s3_server.py [ADDRESS:PORT]
 
-It listens on a port of 127.0.0.1 unless an address is named. It prints its URL, then reads one fault a line from its standard input and prints the line when it is in force:
-`none`; `refuse`, every request is answered with 503; `lie`, every PUT is confirmed and changed before it is stored;
-`deny`, every request is answered with 403. It ends when its input ends.
+It listens on a port of 127.0.0.1 unless an address is named. It prints its URL, then reads one fault a line from its
+standard input and prints the line when it is in force: `none`; `refuse`, every request is answered with 503; `lie`,
+every PUT is confirmed and changed before it is stored; `deny`, every request is answered with 403. It ends when its
+input ends.
 """
 
 import io

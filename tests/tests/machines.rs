@@ -94,7 +94,7 @@ fn stream(line: &str) -> Option<Stream<'_>> {
     not(all(clearway_namespaces, clearway_python)),
     ignore = "needs root and /dev/net/tun: apt-get install iproute2 python3 python3-venv faketime"
 )]
-fn a_thin_uplink_carries_what_somebody_takes_as_often_as_it_bears_and_loses_no_part_of_a_recording() {
+fn a_thin_uplink_carries_the_layers_with_readers_as_often_as_it_bears_and_no_part_of_a_recording_is_lost() {
     let python = fixture::venv::s3();
     let arguments = ["--uplink", "--seconds", "2", "--valid-ms", "1000", "--python", python.to_str().unwrap()];
     let shown = machines(&arguments);
@@ -103,9 +103,9 @@ fn a_thin_uplink_carries_what_somebody_takes_as_often_as_it_bears_and_loses_no_p
         let found = streams.iter().find(|stream| (stream.kbit_s, stream.what, stream.of) == (kbit_s, what, of));
         found.unwrap_or_else(|| panic!("no row {kbit_s} {what} {of}: {shown}"))
     };
-    let (nobody, one) = (find("1000", "nobody reads", ""), find("1000", "one reader", "p1, v00"));
+    let (idle, one) = (find("1000", "no reader", ""), find("1000", "one reader", "p1, v00"));
     let (two, thin) = (find("1000", "one at each router", "p2, v00"), find("200", "one at each router", "p2, v00"));
-    assert!(10.0 * nobody.carried < one.carried, "nobody takes maps: {shown}");
+    assert!(10.0 * idle.carried < one.carried, "no reader, and maps travel: {shown}");
     assert!(two.carried < 1.5 * one.carried, "two readers of a layer cost the uplink once: {shown}");
     assert!(thin.maps_hz > 0.0 && 1.5 * thin.maps_hz < two.maps_hz, "fewer maps fit a thinner link: {shown}");
     assert!(find("200", "gRPC, deltas", "deltas, v00").deltas > 0.0, "{shown}");

@@ -61,8 +61,8 @@ pub struct Publisher {
     tokens: Vec<LivelinessToken>,
     tasks: JoinSet<()>,
     signing_key: Option<Arc<SigningKey>>,
-    /// True if all maps travel over one link, to a router. A peer that stops must not delay the others, so a server with
-    /// several links is not paced by them.
+    /// True if all maps travel over one link, to a router. A server with several links is not paced by them, because a
+    /// peer that stops must not delay the others.
     is_paced: bool,
     /// Each vehicle with the publisher of its replay's end.
     replays: Vec<(Served, Arc<zenoh::pubsub::Publisher<'static>>)>,
@@ -293,7 +293,7 @@ async fn send_maps(
                     let skipped = before.map_or(0, |(_, last)| map.sequence.saturating_sub(last + 1));
                     served.status.transports.skip_for_all(Transport::Zenoh, skipped);
                     let _hop = served.status.traces.hop(&map, "send", Some(Transport::Zenoh.as_str()));
-                    // Nothing travels while nobody subscribes.
+                    // Without a subscriber nothing travels.
                     let probes = probes.as_ref().filter(|_| served.status.transports.count(Transport::Zenoh) > 0);
                     let before = probe(probes).await;
                     send_map(&map, &publishers, signing_key.as_deref()).await;

@@ -1,8 +1,8 @@
 //! What a thin link bears: when a vehicle's next map may follow the last to the router.
 //!
-//! In: probes before and after each map, and their answers. Out: the time from which the next map may be sent. A probe is
-//! a query that no key answers, so that the router ends it at once; it has the maps' priority and travels behind them.
-//! The time between the two answers is what the link takes for the map.
+//! In: probes before and after each map, and their answers. Out: the time from which the next map may be sent. A probe
+//! is a query on a key without a queryable, so that the router ends it at once; it has the maps' priority and travels
+//! behind them. The time between the two answers is what the link takes for the map.
 //!
 //! A map that waits in the queue of a link is old when it arrives, so maps wait here, where a newer one replaces them:
 //! the next is sent when the link has transmitted the last, and two are on the way at most, as over gRPC.
@@ -19,8 +19,8 @@ use crate::zenoh_session::ZenohError;
 
 /// Maps on the way to the router at the same time. Ours: as a gRPC client asks for (`max_in_flight`).
 const ON_THE_WAY_MAX: usize = 2;
-/// Longest wait for an answer. Ours: longer than any link takes for a map that a planner can use. The end of the session
-/// with a router, after its lease, ends its probes before.
+/// Longest wait for an answer. Ours: longer than any link takes for a map that a planner can use. The end of the
+/// session with a router, after its lease, ends its probes before.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The maps of a vehicle that are on the way to the router.
@@ -41,8 +41,8 @@ impl Pace {
         self.free = Some(now + self.transmission);
     }
 
-    /// Records that the oldest map on the way has arrived, for which the link took so long. The link began with the next
-    /// one then, which may have waited in its queue until now.
+    /// Records that the oldest map on the way has arrived, for which the link took so long. If another is on the way, it
+    /// may have waited in the queue of the link until now.
     pub fn arrived(&mut self, now: Instant, transmission: Duration) {
         self.on_the_way -= 1;
         self.transmission = transmission;
@@ -112,8 +112,8 @@ mod tests {
         trip_ms: u64,
     }
 
-    /// Sends the newest of `made` maps, one each [`PERIOD_MS`], as soon as the pace allows. Returns of each map that was
-    /// sent its number and its age in ms when the link has transmitted it.
+    /// Sends the newest of `made` maps, one each [`PERIOD_MS`], as soon as the pace allows. Returns of each map that
+    /// was sent its number and its age in ms when the link has transmitted it.
     fn drive(made: u64, link: &Link) -> Vec<(u64, u64)> {
         let start = Instant::now();
         let at = |ms: u64| start + Duration::from_millis(ms);

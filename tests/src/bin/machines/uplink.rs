@@ -2,8 +2,8 @@
 //! other, and how its recording reaches a store after the uplink was cut.
 //!
 //! The server of the vehicle v00 is s1, with the limited uplink; v01 is at s2, without a limit. The planners p1 and p2,
-//! at a router each, read one layer of both over zenoh; the planner `deltas`, on p2, reads v00 over gRPC with deltas. The
-//! counter of s1's interface says what the uplink carries, with all headers.
+//! at a router each, read one layer of both over zenoh; the planner `deltas`, on p2, reads v00 over gRPC with deltas,
+//! one map on the way at a time. The counter of s1's interface says what the uplink carries, with all headers.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
@@ -70,7 +70,7 @@ struct Phase {
 }
 
 const PHASES: [Phase; 6] = [
-    Phase { kbit_s: 1000, what: "nobody reads", readers: &[] },
+    Phase { kbit_s: 1000, what: "no reader", readers: &[] },
     Phase { kbit_s: 1000, what: "one reader", readers: &["p1"] },
     Phase { kbit_s: 1000, what: "one at each router", readers: &["p1", "p2"] },
     Phase { kbit_s: 200, what: "one at each router", readers: &["p1", "p2"] },
@@ -155,8 +155,8 @@ impl Bed {
         None
     }
 
-    /// Sets the rate and the readers, waits, and prints a row for each of their streams. Returns false if no map becomes
-    /// fresh.
+    /// Sets the rate and the readers, waits, and prints a row for each of their streams. Returns false if no map
+    /// becomes fresh.
     fn measure(&mut self, phase: &Phase, length: Duration) -> bool {
         let is_new = !phase.readers.iter().all(|reader| self.machines.processes.contains_key(*reader));
         self.machines.limit("s1", phase.kbit_s);
