@@ -18,7 +18,8 @@ use crate::freshness::{Arrival, Clock, now_ns};
 /// fresh for good. Ours: far longer than any planner uses a map.
 const VALID_NS_MAX: i64 = 60_000_000_000;
 
-/// Why a map must not be used. [`fmt::Display`] says it in a sentence.
+/// Why a map must not be used. [`fmt::Display`] says it in a sentence, which `client/golden/staleness.json` holds equal
+/// in every client and on the page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Staleness {
     /// Its validity has passed since it arrived, and no newer map has arrived.
@@ -43,12 +44,12 @@ impl fmt::Display for Staleness {
             Self::NoNewer => formatter.write_str("no newer map has arrived"),
             Self::OnArrival { age_ns } => write!(
                 formatter,
-                "it was {:.0} ms old when it arrived: maps are delayed, or the server's clock is behind this machine's",
+                "it was {:.0} ms old when it arrived: maps are delayed, or its stamps are behind the reader's clock",
                 ms(*age_ns)
             ),
             Self::InTheFuture { ahead_ns } => write!(
                 formatter,
-                "it was captured {:.0} ms in the future: the server's clock is ahead of this machine's",
+                "it was captured {:.0} ms in the future: its stamps are ahead of the reader's clock",
                 ms(*ahead_ns)
             ),
         }

@@ -52,12 +52,23 @@ export class ServerClock {
   }
 }
 
-// The age of a map at the server's time now_ns: { age_ms, validity_ms, fresh, why }. A map of unknown age is not fresh.
-export function freshness(header, now_ns) {
+// The age of a map that came at the server's time came_ns, at its time now_ns: { age_ms, validity_ms, fresh, why }. Why
+// a map is not fresh is said in the words of every client (client/golden/staleness.json). One of unknown age is not.
+export function freshness(header, came_ns, now_ns) {
   const validity_ms = Number(header.valid_until_ns - header.capture_end_ns) / 1e6;
   if (now_ns === null) return { age_ms: null, validity_ms, fresh: false, why: "age unknown until the next map" };
-  const age_ms = Number(now_ns - header.capture_end_ns) / 1e6;
-  if (age_ms < -AHEAD_MS_MAX) return { age_ms, validity_ms, fresh: false, why: "its stamp is in the future" };
-  const fresh = now_ns <= header.valid_until_ns;
-  return { age_ms, validity_ms, fresh, why: fresh ? "" : "its validity has passed" };
+  const ageAt_ms = (at_ns) => Number(at_ns - header.capture_end_ns) / 1e6;
+  const why = staleness(ageAt_ms(came_ns ?? now_ns), ageAt_ms(now_ns), validity_ms);
+  return { age_ms: ageAt_ms(now_ns), validity_ms, fresh: why === null, why: why ?? "" };
+}
+
+function staleness(on_arrival_ms, age_ms, validity_ms) {
+  if (age_ms < -AHEAD_MS_MAX) {
+    return `it was captured ${(-age_ms).toFixed()} ms in the future: its stamps are ahead of the reader's clock`;
+  }
+  if (on_arrival_ms > validity_ms) {
+    const causes = "maps are delayed, or its stamps are behind the reader's clock";
+    return `it was ${on_arrival_ms.toFixed()} ms old when it arrived: ${causes}`;
+  }
+  return age_ms > validity_ms ? "no newer map has arrived" : null;
 }

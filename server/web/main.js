@@ -66,6 +66,7 @@ const FROM_WORKER = {
     if (!clock.sample(local(frame.arrived_ms), frame.sent_ns)) {
       post({ type: "reconnect", text: "The connection lags; starting again" });
     }
+    frame.came_ns = clock.now_ns(local(frame.arrived_ms));
     frames.set(frame.vehicle, frame);
     if (is_draw_scheduled) return;
     is_draw_scheduled = true;

@@ -1,6 +1,7 @@
 // Tests of what the page must never get wrong: ages and counts. Run: cd server/web && node --test
 
 import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
 import test from "node:test";
 import { freshness, ServerClock } from "./clock.js";
 import { paintChannel } from "./draw/paint.js";
@@ -15,7 +16,8 @@ test("a skewed clock does not change an age", () => {
   for (const skew of [-3.6e6, 0, 3.6e6]) {
     const clock = new ServerClock(), start = 1.7e12 + skew;
     for (const [at, delay] of [[0, 20], [100, 5], [200, 60]]) clock.sample(at + delay, ns(start + at));
-    const age = freshness({ capture_end_ns: ns(start + 150), valid_until_ns: ns(start + 450) }, clock.now_ns(260));
+    const header = { capture_end_ns: ns(start + 150), valid_until_ns: ns(start + 450) };
+    const age = freshness(header, null, clock.now_ns(260));
     assert.ok(Math.abs(age.age_ms - 105) < 0.1, `${age.age_ms} ms at skew ${skew}`);
     assert.ok(age.fresh);
   }
@@ -27,7 +29,7 @@ test("a delay that grows a millisecond a map becomes stale", () => {
   for (let i = 0; i < 600; i++) {
     const sent = 1e12 + i * 100, received = i * 100 + i;
     clock.sample(received, ns(sent));
-    age = freshness({ capture_end_ns: ns(sent - 60), valid_until_ns: ns(sent + 240) }, clock.now_ns(received));
+    age = freshness({ capture_end_ns: ns(sent - 60), valid_until_ns: ns(sent + 240) }, null, clock.now_ns(received));
   }
   assert.equal(age.fresh, false);
   assert.ok(age.age_ms > 640, `${age.age_ms} ms`);
@@ -35,8 +37,17 @@ test("a delay that grows a millisecond a map becomes stale", () => {
 
 test("a map whose time is unknown, past or from the future is not fresh", () => {
   const header = { capture_end_ns: ns(1000), valid_until_ns: ns(1300) };
-  const fresh = (now) => freshness(header, now).fresh;
+  const fresh = (now) => freshness(header, ns(1000), now).fresh;
   assert.deepEqual([null, ns(1301), ns(800), ns(1300)].map(fresh), [false, false, false, true]);
+});
+
+test("a stale map says why in the words of every client", () => {
+  const cases = JSON.parse(readFileSync(new URL("../../client/golden/staleness.json", import.meta.url)));
+  for (const { age_on_arrival_ms, since_arrival_ms, stale_because } of cases) {
+    const came = ns(5000 + age_on_arrival_ms);
+    const age = freshness({ capture_end_ns: ns(5000), valid_until_ns: ns(5300) }, came, came + ns(since_arrival_ms));
+    assert.deepEqual([age.fresh, age.why], [stale_because === null, stale_because ?? ""]);
+  }
 });
 
 test("a sensor's clock is named with how far the host is from it", () => {

@@ -4,8 +4,9 @@
 
 Makes the namespace NAME with the interface `wire` and the address 10.99.0.HOST/24 (and HOST + 100, for a machine that
 moves) for each machine; `ip netns exec NAME` runs a program there. Then it prints `ready` and takes lines from standard
-input: `A B DELAY_MS LOSS` (LOSS is a share, 0 to 1; 1 cuts the link) changes the link between two machines, both ways.
-The namespaces end with the hub. It needs root.
+input: `A B DELAY_MS LOSS` (LOSS is a share, 0 to 1; 1 cuts the link) changes the link between two machines, both ways;
+`A KBIT_S` is the rate at which a machine sends, and at which it receives, to and from all others (0: without a limit).
+What is faster waits in a queue, and is dropped if that is full. The namespaces end with the hub. It needs root.
 """
 
 import fcntl
@@ -19,6 +20,8 @@ import sys
 import time
 
 TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x400454CA, 1, 0x1000
+#: Bytes that wait for a link with a rate, each way. Ours: as in a modem, half a second at 1 Mbit/s.
+QUEUE_BYTES = 1 << 16
 
 
 def ip(*arguments: str) -> None:
@@ -41,10 +44,30 @@ def machine(name: str, host: int) -> int:
     return tun
 
 
+class Rates:
+    """The rates of the machines' links to the hub, and when each is free again."""
+
+    def __init__(self) -> None:
+        self.bytes_s: dict[int, float] = {}
+        self._free: dict[tuple[int, str], float] = {}
+
+    def after(self, at: float, machine: int, way: str, length: int) -> float | None:
+        """When the link has carried a packet that reaches it at a time; `None` if its queue is full."""
+        rate = self.bytes_s.get(machine, 0.0)
+        if rate == 0.0:
+            return at
+        begins = max(at, self._free.get((machine, way), 0.0))
+        if (begins - at) * rate + length > QUEUE_BYTES:
+            return None
+        self._free[machine, way] = begins + length / rate
+        return self._free[machine, way]
+
+
 def main() -> None:
     hosts = {name: int(host) for name, host in (argument.split(":") for argument in sys.argv[1:])}
     seeded = random.Random(16)
     links: dict[frozenset[int], tuple[float, float]] = {}
+    rates = Rates()
     waiting: list[tuple[float, int, int, bytes]] = []
     passed, begun = 0, ""
     try:
@@ -63,7 +86,11 @@ def main() -> None:
                     if not text:
                         return
                     *lines, begun = (begun + text).split("\n")
-                    for first, second, delay_ms, loss in map(str.split, lines):
+                    for words in map(str.split, lines):
+                        if len(words) == 2:
+                            rates.bytes_s[hosts[words[0]]] = float(words[1]) * 1e3 / 8
+                            continue
+                        first, second, delay_ms, loss = words
                         links[frozenset((hosts[first], hosts[second]))] = float(delay_ms) / 1e3, float(loss)
                     continue
                 try:
@@ -76,8 +103,11 @@ def main() -> None:
                     continue
                 delay_s, loss = links.get(frozenset((key.data, to)), (0.0, 0.0))
                 if seeded.random() >= loss:
-                    passed += 1
-                    heapq.heappush(waiting, (time.monotonic() + delay_s, passed, to, packet))
+                    at = rates.after(time.monotonic(), key.data, "sends", len(packet))
+                    at = at and rates.after(at + delay_s, to, "receives", len(packet))
+                    if at is not None:
+                        passed += 1
+                        heapq.heappush(waiting, (at, passed, to, packet))
             now = time.monotonic()
             while waiting and waiting[0][0] <= now:
                 _, _, to, packet = heapq.heappop(waiting)

@@ -1,8 +1,11 @@
 """An S3-compatible server with the bucket `fleet`, and the faults that tests ask for.
 
-It prints its URL, then reads one fault a line from its standard input and prints the line when it is in force:
-`none`; `refuse`, every request is answered with 503; `lie`, every PUT is confirmed and changed before it is stored;
-`deny`, every request is answered with 403. It ends when its input ends.
+    s3_server.py [ADDRESS:PORT]
+
+It listens on a port of 127.0.0.1 unless an address is named. It prints its URL, then reads one fault a line from its
+standard input and prints the line when it is in force: `none`; `refuse`, every request is answered with 503; `lie`,
+every PUT is confirmed and changed before it is stored; `deny`, every request is answered with 403. It ends when its
+input ends.
 """
 
 import io
@@ -34,9 +37,10 @@ def application(environ, start_response):
 
 def main():
     global fault
-    server = make_server("127.0.0.1", 0, application, threaded=True)
+    address, port = (sys.argv[1:] or ["127.0.0.1:0"])[0].split(":")
+    server = make_server(address, int(port), application, threaded=True)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    url = f"http://127.0.0.1:{server.server_port}"
+    url = f"http://{address}:{server.server_port}"
     keys = {"aws_access_key_id": "test", "aws_secret_access_key": "test", "region_name": "us-east-1"}
     boto3.client("s3", endpoint_url=url, **keys).create_bucket(Bucket="fleet")
     print(url, flush=True)

@@ -16,6 +16,8 @@ pub mod growth;
 #[cfg(feature = "siege")]
 pub mod larger_fleet;
 #[cfg(feature = "siege")]
+pub mod machines;
+#[cfg(feature = "siege")]
 pub mod roles;
 #[cfg(feature = "siege")]
 pub mod siege;

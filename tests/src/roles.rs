@@ -11,11 +11,16 @@ use std::time::{Duration, Instant};
 
 use clap::Subcommand;
 use clearway::config::{Config, Vehicle, ZenohMode};
-use clearway_client::{Client, MapStream, Observation, Staleness, StreamEvent, ZenohClient, now_ns};
+use clearway_client::{
+    Client, MapStream, MapView, Observation, Staleness, StreamEvent, Subscription, Update, ZenohClient, now_ns,
+};
 use clearway_lidar::model::Model;
+use clearway_proto::v1;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::vehicle::SimulatedVehicle;
+use prost::Message;
+use rand::{Rng, SeedableRng};
 
 use crate::packets::{packets, send};
 
@@ -42,6 +47,19 @@ pub enum Role {
     Feed {
         /// Names of the vehicles.
         vehicles: String,
+        /// Scans of rough ground with walls, each another one, instead of the same plain.
+        #[arg(long)]
+        rough: bool,
+    },
+    /// Prints of each map of a layer, and when the newest becomes stale: the vehicle, `fresh` or why it is stale, its
+    /// age in ms, its bytes, `whole` or `delta`.
+    Ages {
+        /// Endpoints of routers; the first that answers is used. Or `grpc:` and the address of a server, for deltas.
+        endpoints: String,
+        /// Names of the vehicles.
+        vehicles: String,
+        /// The layer.
+        layer: String,
     },
     /// Prints when a stream becomes stale, and why, or fresh, or changes its server.
     Read {
@@ -84,7 +102,8 @@ impl Role {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().expect("a runtime");
         match self {
-            Self::Feed { vehicles } => runtime.block_on(feed(vehicles)),
+            Self::Feed { vehicles, rough } => runtime.block_on(feed(vehicles, *rough)),
+            Self::Ages { endpoints, vehicles, layer } => runtime.block_on(age(endpoints, vehicles, layer)),
             Self::Read { endpoints, vehicles } => runtime.block_on(read(endpoints, vehicles)),
             Self::Router { listen, others } => runtime.block_on(route(listen, others)),
             Self::Planners { endpoint, vehicles } => runtime.block_on(plan(endpoint, vehicles)),
@@ -140,14 +159,33 @@ pub fn server_config(vehicles: &[String], routers: &[String]) -> Config {
     config
 }
 
-/// Ten scans a second of each vehicle: a plain, 1,440 points.
-async fn feed(vehicles: &str) {
+/// The points of a scan, x, y and z: a plain, 1,440 points.
+fn plain() -> [Vec<f32>; 3] {
     let rays = || (0..1440_u32).map(|ray| (f64::from(ray).to_radians(), 3.0 + f64::from(ray / 360) * 4.0));
     let list = |of: &dyn Fn(f64, f64) -> f64| rays().map(|(angle, range_m)| of(angle, range_m) as f32).collect();
-    let x: Vec<f32> = list(&|angle, range_m| angle.cos() * range_m);
-    let y: Vec<f32> = list(&|angle, range_m| angle.sin() * range_m);
-    let z: Vec<f32> = list(&|_, _| -2.0);
-    let feeds = vehicles.split(',').map(|vehicle| async {
+    [list(&|angle, range_m| angle.cos() * range_m), list(&|angle, range_m| angle.sin() * range_m), list(&|_, _| -2.0)]
+}
+
+/// The points of a scan as [`plain`]: 32 rings of rough ground, and walls here and there, another scan for each number.
+/// Its maps of `speed` are as long as those of a recorded drive.
+fn rough(number: u64) -> [Vec<f32>; 3] {
+    let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(number);
+    let mut points: [Vec<f32>; 3] = Default::default();
+    for ray in 0..5760_u32 {
+        let (angle, ring) = (f64::from(2 * ray).to_radians(), f64::from(ray / 180));
+        let (range_m, z_m) = (3.0 + ring + random.random_range(0.0..1.0), random.random_range(0.0..0.1));
+        let is_wall = ring > 8.0 && ray % 180 % 20 < 4;
+        let z_m = if is_wall { z_m - 1.0 } else { z_m - 2.0 };
+        let point = [angle.cos() * range_m, angle.sin() * range_m, z_m];
+        points.iter_mut().zip(point).for_each(|(list, value)| list.push(value as f32));
+    }
+    points
+}
+
+/// Ten scans a second of each vehicle.
+async fn feed(vehicles: &str, is_rough: bool) {
+    let feeds = vehicles.split(',').map(|vehicle| async move {
+        let ([mut x, mut y, mut z], mut number) = (plain(), 0);
         let mut every = tokio::time::interval(Duration::from_millis(100));
         loop {
             every.tick().await;
@@ -155,6 +193,10 @@ async fn feed(vehicles: &str) {
             let Ok(mut ingester) = client.ingest(vehicle).await else { continue };
             while ingester.send(Observation::scan("top", now_ns(), &x, &y, &z)).await.is_ok() {
                 every.tick().await;
+                if is_rough {
+                    number += 1;
+                    [x, y, z] = rough(number);
+                }
             }
         }
     });
@@ -186,20 +228,64 @@ async fn read(endpoints: &str, vehicles: &str) {
                     println!("{vehicle} run {boot_id}");
                     run = boot_id;
                 }
-                let why = match update.map.staleness(update.map.now_ns()) {
-                    None => "fresh",
-                    Some(Staleness::NoNewer) => "stale no-newer",
-                    Some(Staleness::OnArrival { .. }) => "stale old-on-arrival",
-                    Some(Staleness::InTheFuture { .. }) => "stale in-the-future",
-                };
+                let why = freshness(&update.map);
                 if why != said {
-                    println!("{vehicle} {why}");
+                    println!("{vehicle} {}{why}", if why == "fresh" { "" } else { "stale " });
                     said = why;
                 }
             }
         }
     });
     futures::future::join_all(streams).await;
+}
+
+/// `fresh`, or why a map is stale.
+fn freshness(map: &MapView) -> &'static str {
+    match map.staleness(map.now_ns()) {
+        None => "fresh",
+        Some(Staleness::NoNewer) => "no-newer",
+        Some(Staleness::OnArrival { .. }) => "old-on-arrival",
+        Some(Staleness::InTheFuture { .. }) => "in-the-future",
+    }
+}
+
+/// Follows a layer of every vehicle.
+async fn age(endpoints: &str, vehicles: &str, layer: &str) {
+    let mut streams = Vec::new();
+    for vehicle in vehicles.split(',') {
+        streams.push(match endpoints.strip_prefix("grpc:") {
+            Some(server) => subscribe_deltas(server, vehicle, layer).await,
+            None => connect(endpoints).await.subscribe(vehicle, layer).await.expect("a subscription"),
+        });
+    }
+    futures::future::join_all(streams.into_iter().map(|mut maps| async move {
+        while let Ok(event) = maps.next_or_stale().await {
+            let (StreamEvent::Fresh(Update { map, .. }) | StreamEvent::Stale(Update { map, .. })) = event;
+            let encoded = v1::Map::decode(map.bytes().clone()).expect("it was decoded before");
+            let is_delta = encoded.layers.iter().any(|layer| layer.base_sequence.is_some());
+            let (kind, bytes) = (if is_delta { "delta" } else { "whole" }, map.bytes().len());
+            println!("{} {} {:.0} {bytes} {kind}", map.vehicle(), freshness(&map), map.age_ms(map.now_ns()));
+        }
+    }))
+    .await;
+}
+
+/// A stream of one layer from a server, with deltas.
+async fn subscribe_deltas(server: &str, vehicle: &str, layer: &str) -> MapStream {
+    let subscription = Subscription {
+        vehicle: vehicle.into(),
+        layers: vec![layer.into()],
+        deltas: true,
+        max_in_flight: 1,
+        ..Subscription::default()
+    };
+    loop {
+        let Ok(client) = Client::connect(server).await else { continue };
+        match client.subscribe(subscription.clone()).await {
+            Ok(maps) => return maps,
+            Err(_) => tokio::time::sleep(Duration::from_millis(100)).await,
+        }
+    }
 }
 
 /// The router of `deploy/`, in plain text and without access control.

@@ -162,9 +162,7 @@ struct S3 {
 
 impl S3 {
     fn start() -> Self {
-        const PACKAGE: &str = "moto[server]==5.2.5";
-        let python = venv::environment("python-s3", PACKAGE, |_| vec![PACKAGE.into()]);
-        let mut process = Command::new(python)
+        let mut process = Command::new(venv::s3())
             .arg("-B")
             .arg(workspace().join("tests/python/s3_server.py"))
             .stdin(Stdio::piped())

@@ -350,8 +350,25 @@ class Map:
     def is_stale(self, at_ns: int) -> bool:
         """True if the map must not be used at a time: its validity has passed, or its capture is so far in the future
         of that time that its age cannot be known."""
+        return self.staleness(at_ns) is not None
+
+    @property
+    def stale_because(self) -> str | None:
+        """Why the map must not be used any more, in a sentence; `None` if it may be used."""
+        return self.staleness(self._now_ns())
+
+    def staleness(self, at_ns: int) -> str | None:
+        """Why the map must not be used at a time, in a sentence; `None` if it may be used. The sentences are those of
+        `Staleness` of the Rust client (`client/golden/staleness.json`)."""
         valid_ns = self._valid_ns()
-        return self.age_ns(at_ns) > valid_ns or at_ns - self.header.capture_end_ns < -valid_ns
+        ahead_ns = self.header.capture_end_ns - at_ns
+        if ahead_ns > valid_ns:
+            return f"it was captured {ahead_ns * 1e-6:.0f} ms in the future: its stamps are ahead of the reader's clock"
+        came_ns = 0 if self._arrival is None else self._arrival.age_ns
+        if came_ns > valid_ns:
+            causes = "maps are delayed, or its stamps are behind the reader's clock"
+            return f"it was {came_ns * 1e-6:.0f} ms old when it arrived: {causes}"
+        return "no newer map has arrived" if self.age_ns(at_ns) > valid_ns else None
 
     def fresh_for_s(self) -> float:
         """Time from now until the map is stale, in seconds; 0 if it is stale."""

@@ -1,6 +1,9 @@
 """Situations in which a map is older than it seems (see the Rust client's stream.rs), with clocks that the tests
 set."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 import clearway
@@ -11,6 +14,7 @@ from clearway.v1 import map_pb2
 MS = 1_000_000
 START_NS = 1_700_000_000_000_000_000
 VALID_MS = 300
+STALENESS = json.loads((Path(__file__).resolve().parents[2] / "golden" / "staleness.json").read_text())
 
 
 class TestBed:
@@ -126,6 +130,15 @@ def test_a_step_of_the_wall_clock_makes_no_stale_map_fresh(step_ms):
     for further in (0, step_ms, 10 * step_ms):
         at_ns = bed.wall_ns + further * MS
         assert stale.is_stale(at_ns) and stale.age_ns(at_ns) >= 440 * MS
+
+
+@pytest.mark.parametrize("case", STALENESS)
+def test_a_stale_map_says_why_in_the_words_of_every_client(case):
+    bed = TestBed()
+    bed.store_aged(7, 0, case["age_on_arrival_ms"] * MS)
+    bed.pass_(case["since_arrival_ms"] * MS)
+    newest = bed.stream.newest()
+    assert (newest.stale, newest.stale_because) == (case["stale_because"] is not None, case["stale_because"])
 
 
 def test_a_stream_polls_its_clocks_often_enough_for_the_promised_50_ms():

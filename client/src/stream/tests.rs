@@ -207,6 +207,21 @@ async fn a_stale_map_says_whether_the_clocks_differ_or_no_newer_map_came() {
     assert_eq!(newest.staleness(bed.wall_ns.load(Ordering::SeqCst)), Some(Staleness::NoNewer));
 }
 
+#[tokio::test]
+async fn the_words_for_a_stale_map_are_those_of_the_golden_file() {
+    let cases: Vec<serde_json::Value> = serde_json::from_str(include_str!("../../golden/staleness.json")).unwrap();
+    assert_eq!(cases.len(), 5);
+    for case in cases {
+        let ms = |name: &str| case[name].as_i64().expect(name) * MS;
+        let bed = TestBed::new();
+        bed.store_aged(7, 0, ms("age_on_arrival_ms"));
+        bed.pass(ms("since_arrival_ms"));
+        let newest = bed.stream.newest().expect("a map was stored");
+        let why = newest.staleness(bed.wall_ns.load(Ordering::SeqCst)).map(|why| why.to_string());
+        assert_eq!(serde_json::json!(why), case["stale_because"], "{case}");
+    }
+}
+
 #[test]
 fn a_stream_polls_its_clocks_often_enough_for_the_promised_50_ms() {
     assert!(POLL_INTERVAL * 2 <= Duration::from_millis(50));

@@ -11,15 +11,20 @@
 //!
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
 //!
+//! A server that is the client of a router sends a map when the link has transmitted the last (`zenoh_pace`), so that a
+//! thin link has fewer maps and not older ones; the maps between count as skipped.
+//!
 //! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a
 //! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
 //! reports have zenoh's default priority.
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clearway_client::signature::SigningKey;
+use futures::StreamExt;
+use futures::stream::FuturesUnordered;
 use serde_json::Value;
 use tokio::task::JoinSet;
 use zenoh::Session;
@@ -33,7 +38,8 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 
 use super::ros::Node;
 use super::served::{Served, Vehicles};
-use crate::config::{Zenoh as Options, secret};
+use super::zenoh_pace::{Pace, Probe, Probes};
+use crate::config::{Zenoh as Options, ZenohMode, secret};
 use crate::encode::EncodedMap;
 use crate::status::{Reader, Transport, state_changed};
 use crate::zenoh_session::ZenohError;
@@ -55,6 +61,9 @@ pub struct Publisher {
     tokens: Vec<LivelinessToken>,
     tasks: JoinSet<()>,
     signing_key: Option<Arc<SigningKey>>,
+    /// True if all maps travel over one link, to a router. A server with several links is not paced by them, because a
+    /// peer that stops must not delay the others.
+    is_paced: bool,
     /// Each vehicle with the publisher of its replay's end.
     replays: Vec<(Served, Arc<zenoh::pubsub::Publisher<'static>>)>,
 }
@@ -68,7 +77,8 @@ impl Publisher {
     pub async fn start(session: &Session, options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
         let signing_key = signing_key(&options.signing_key)?.map(Arc::new);
         let (tokens, tasks, replays) = (Vec::new(), JoinSet::new(), Vec::new());
-        let mut publisher = Self { session: session.clone(), tokens, tasks, signing_key, replays };
+        let is_paced = options.mode == ZenohMode::Client;
+        let mut publisher = Self { session: session.clone(), tokens, tasks, signing_key, is_paced, replays };
         for served in vehicles.0.iter() {
             publisher.publish(served).await?;
         }
@@ -141,7 +151,8 @@ impl Publisher {
         let replay = Arc::new(replay.map_err(ZenohError::of(format!("publisher {key}")))?);
         self.replays.push((served.clone(), replay.clone()));
         self.answer_replay(served, key).await?;
-        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay));
+        let probes = self.is_paced.then(|| Probes::new(&self.session, vehicle, MAPS));
+        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay, probes));
         self.watch_claims(served).await?;
         self.tasks.spawn({
             let served = served.clone();
@@ -261,14 +272,17 @@ async fn send_maps(
     publishers: Vec<(&'static str, String, Arc<AdvancedPublisher<'static>>)>,
     signing_key: Option<Arc<SigningKey>>,
     replay: Arc<zenoh::pubsub::Publisher<'static>>,
+    probes: Option<Probes>,
 ) {
+    let (mut pace, mut on_the_way) = (Pace::default(), FuturesUnordered::new());
     let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
     newest.mark_changed();
     let (mut reported, mut last) = (false, None);
     loop {
+        let wait = pace.wait(Instant::now());
         tokio::select! {
             biased;
-            changed = newest.changed() => {
+            changed = newest.changed(), if wait == Some(Duration::ZERO) => {
                 if changed.is_err() {
                     break;
                 }
@@ -279,9 +293,18 @@ async fn send_maps(
                     let skipped = before.map_or(0, |(_, last)| map.sequence.saturating_sub(last + 1));
                     served.status.transports.skip_for_all(Transport::Zenoh, skipped);
                     let _hop = served.status.traces.hop(&map, "send", Some(Transport::Zenoh.as_str()));
+                    // Without a subscriber nothing travels.
+                    let probes = probes.as_ref().filter(|_| served.status.transports.count(Transport::Zenoh) > 0);
+                    let before = probe(probes).await;
                     send_map(&map, &publishers, signing_key.as_deref()).await;
+                    if let (Some(before), Some(after)) = (before, probe(probes).await) {
+                        pace.sent(Instant::now());
+                        on_the_way.push(async { (before.answered().await, after.answered().await) });
+                    }
                 }
             }
+            Some((before, after)) = on_the_way.next() => pace.arrived(Instant::now(), after.duration_since(before)),
+            () = tokio::time::sleep(wait.unwrap_or_default()), if wait.is_some_and(|wait| !wait.is_zero()) => {}
             Ok(()) = replay_ended.changed() => {}
         }
         let ended = *replay_ended.borrow();
@@ -292,6 +315,17 @@ async fn send_maps(
     }
     // The engine has stopped, but the current map stays in the caches until the session ends.
     std::future::pending::<()>().await;
+}
+
+/// Sends a probe of the link, if maps are paced by it.
+async fn probe(probes: Option<&Probes>) -> Option<Probe> {
+    match probes?.send().await {
+        Ok(probe) => Some(probe),
+        Err(error) => {
+            tracing::warn!(%error, "zenoh: maps are sent without pacing");
+            None
+        }
+    }
 }
 
 /// Whether the replay has ended, for its key.

@@ -156,7 +156,7 @@ export class FleetView {
 
   #writeCard(card, now_ms) {
     const { status, frame, parts, element } = card;
-    const shown = frame && freshness(frame.header, this.#clock.now_ns(now_ms));
+    const shown = frame && freshness(frame.header, frame.came_ns, this.#clock.now_ns(now_ms));
     card.age_ms = ageOf(status, now_ms - card.status_arrived_ms, shown?.age_ms);
     card.fresh = freshOf(card.age_ms, shown?.validity_ms ?? status.map_valid_ms);
     card.speed = status.speed_m_s ?? frame?.header.speed_mps ?? null;

@@ -190,7 +190,7 @@ export class VehicleView {
     let wait_ms = AGE_EVERY_MS;
     try {
       const now_ms = performance.now();
-      const age = this.#shown && freshness(this.#shown.header, this.#clock.now_ns(now_ms));
+      const age = this.#shown && freshness(this.#shown.header, this.#shown.came_ns, this.#clock.now_ns(now_ms));
       this.#writeFreshness(age);
       if (age?.fresh) wait_ms = Math.min(wait_ms, Math.max(1, age.validity_ms - age.age_ms + 1));
       if (now_ms - this.#metrics_at_ms >= METRICS_EVERY_MS) {

@@ -9,17 +9,22 @@
 //! until every stream was fresh again; how many streams had maps of another run of a server than before; and why the
 //! concerned streams said they were stale, with their number.
 //!
+//! `--uplink`: the thin uplink of a vehicle instead (`uplink.rs`).
+//!
 //! A clock is set by libfaketime (Debian: `apt-get install faketime`) for the processes of one machine.
 
+mod uplink;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{BufRead, BufReader, Write};
-use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, ExitCode, Stdio};
+use std::io::{BufRead, BufReader};
+use std::path::PathBuf;
+use std::process::{Command, ExitCode};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use clearway_tests::roles::{Process, ROUTER_ENVIRONMENT, Role, name, server_binary, server_config};
+use clearway_tests::machines::{Machines, ROUTERS};
+use clearway_tests::roles::{Process, Role, name, server_config};
 
 /// Faults between machines.
 #[derive(Parser)]
@@ -38,13 +43,17 @@ struct Arguments {
     /// The faults that are made; all by default.
     #[arg(long, value_delimiter = ',')]
     faults: Vec<String>,
+    /// The thin uplink of a vehicle instead of the faults.
+    #[arg(long)]
+    uplink: bool,
+    /// For `--uplink`: an interpreter with the package `moto`, whose server is the store.
+    #[arg(long, default_value = "python3")]
+    python: PathBuf,
     /// The server's binary; by default `clearway` beside this one.
     #[arg(long)]
     server: Option<PathBuf>,
 }
 
-const HOSTS: &str = "r1:1 r2:2 s1:11 s2:12 s3:13 p1:21 p2:22";
-const ROUTERS: [&str; 2] = ["tcp/10.99.0.1:7447", "tcp/10.99.0.2:7447"];
 const SERVERS: [&str; 3] = ["s1", "s2", "s3"];
 const PLANNERS: [&str; 2] = ["p1", "p2"];
 /// The vehicle that two servers claim for a while.
@@ -58,6 +67,7 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     match &arguments.role {
         Some(role) => role.run(),
+        None if arguments.uplink => return uplink::run(&arguments),
         None => return run(&arguments),
     }
     ExitCode::SUCCESS
@@ -76,58 +86,6 @@ struct Shown {
 }
 
 type Streams = Arc<Mutex<BTreeMap<(&'static str, String), Shown>>>;
-
-/// A program in the namespace of a machine, by a clock that is this much ahead, such as `+2s`; empty: by the true one.
-fn command(machine: &str, clock: &str, program: &Path, arguments: &[&str]) -> Command {
-    let mut command = Command::new("ip");
-    command.args(["netns", "exec", machine]);
-    if !clock.is_empty() {
-        let library = faketime().expect("libfaketime: apt-get install faketime");
-        let settings = [format!("LD_PRELOAD={}", library.display()), format!("FAKETIME={clock}")];
-        // A host's clock that is set does not move its steady clock.
-        command.arg("env").args(settings).args(["DONT_FAKE_MONOTONIC=1", "FAKETIME_DONT_FAKE_MONOTONIC=1"]);
-    }
-    command.arg(program).args(arguments);
-    command
-}
-
-/// The library of the Debian package that sets the clock of a program with several threads.
-fn faketime() -> Option<PathBuf> {
-    let architectures = std::fs::read_dir("/usr/lib").ok()?.flatten();
-    let mut libraries = architectures.map(|folder| folder.path().join("faketime/libfaketimeMT.so.1"));
-    libraries.find(|library| library.is_file())
-}
-
-/// The links between the machines.
-struct Hub {
-    process: Child,
-    rules: Option<ChildStdin>,
-}
-
-impl Hub {
-    fn start() -> Self {
-        let script = clearway_tests::workspace().join("tests/python/hub.py");
-        let mut command = Command::new("python3");
-        command.arg(script).args(HOSTS.split(' ')).stdin(Stdio::piped()).stdout(Stdio::piped());
-        let mut process = command.spawn().expect("python3 is installed");
-        let mut line = String::new();
-        BufReader::new(process.stdout.take().expect("piped")).read_line(&mut line).expect("the hub lives");
-        assert_eq!(line.trim(), "ready", "the hub needs root, /dev/net/tun and ip");
-        Self { rules: process.stdin.take(), process }
-    }
-
-    fn link(&mut self, first: &str, second: &str, delay_ms: u32, loss: f64) {
-        let rules = self.rules.as_mut().expect("it is taken at the end");
-        writeln!(rules, "{first} {second} {delay_ms} {loss}").and_then(|()| rules.flush()).expect("the hub lives");
-    }
-}
-
-impl Drop for Hub {
-    fn drop(&mut self) {
-        drop(self.rules.take());
-        let _ended = self.process.wait();
-    }
-}
 
 /// Follows the lines of a reader. A reader that has ended has no fresh map.
 fn follow(planner: &'static str, process: &mut Process, streams: &Streams) {
@@ -179,11 +137,7 @@ struct Fault {
 
 /// The run: what is started, and what the streams show.
 struct Bed {
-    own: PathBuf,
-    server: PathBuf,
-    folder: tempfile::TempDir,
-    hub: Hub,
-    processes: BTreeMap<String, Process>,
+    machines: Machines,
     streams: Streams,
     /// The vehicles of each server.
     vehicles: [Vec<String>; 3],
@@ -192,54 +146,30 @@ struct Bed {
 }
 
 impl Bed {
-    /// Starts a role of this binary instead of the process of the same name.
-    fn start(&mut self, name: &str, machine: &str, clock: &str, arguments: &[&str]) {
-        self.stop(&[name]);
-        let process = Process::start(&mut command(machine, clock, &self.own, arguments));
-        self.processes.insert(name.into(), process);
-    }
-
-    fn stop(&mut self, names: &[&str]) {
-        names.iter().for_each(|name| drop(self.processes.remove(*name)));
-    }
-
-    fn start_router(&mut self, index: usize) {
-        let name = ["r1", "r2"][index];
-        let mut command = command(name, "", &self.own, &["router", "tcp/0.0.0.0:7447", ROUTERS[1 - index]]);
-        command.env(ROUTER_ENVIRONMENT.0, ROUTER_ENVIRONMENT.1);
-        self.processes.insert(name.into(), Process::start(&mut command));
-    }
-
     /// Starts the server of this machine with these vehicles.
     fn start_server(&mut self, machine: &str, clock: &str, vehicles: &[String]) {
         let mut config = server_config(vehicles, &ROUTERS.map(str::to_owned));
         config.vehicles.iter_mut().for_each(|vehicle| vehicle.maps.valid_ms = self.valid_ms);
-        let file = self.folder.path().join(format!("{machine}.toml"));
-        std::fs::write(&file, config.to_toml()).expect("a file of ours");
-        let arguments = ["serve", "--config", file.to_str().expect("UTF-8")];
-        let name = format!("{machine} server");
-        self.stop(&[&name]);
-        let process = Process::start(&mut command(machine, clock, &self.server, &arguments));
-        self.processes.insert(name, process);
+        self.machines.start_server(machine, clock, &config, &[]);
     }
 
     /// Changes the links of a server or planner to both routers.
     fn links(&mut self, machine: &str, delay_ms: u32, loss: f64) {
-        ["r1", "r2"].iter().for_each(|router| self.hub.link(machine, router, delay_ms, loss));
+        ["r1", "r2"].iter().for_each(|router| self.machines.link(machine, router, delay_ms, loss));
     }
 
     /// Starts a server with its vehicles, and the sender of their scans.
     fn start_vehicles(&mut self, index: usize, clock: &str) {
         let (machine, vehicles) = (SERVERS[index], self.vehicles[index].clone());
         self.start_server(machine, clock, &vehicles);
-        self.start(&format!("{machine} feed"), machine, clock, &["feed", &vehicles.join(",")]);
+        self.machines.start_role(&format!("{machine} feed"), machine, clock, &["feed", &vehicles.join(",")]);
     }
 
     fn start_planner(&mut self, index: usize, clock: &str) {
         let (planner, all) = (PLANNERS[index], self.vehicles.concat().join(","));
         let endpoints = [ROUTERS[index], ROUTERS[1 - index]].join(",");
-        self.start(planner, planner, clock, &["read", &endpoints, &all]);
-        follow(planner, self.processes.get_mut(planner).expect("just started"), &self.streams);
+        let process = self.machines.start_role(planner, planner, clock, &["read", &endpoints, &all]);
+        follow(planner, process, &self.streams);
     }
 
     /// Waits until every stream is fresh; the time that it took.
@@ -312,16 +242,13 @@ fn run(arguments: &Arguments) -> ExitCode {
     }
     let faults: Vec<_> =
         all.into_iter().filter(|fault| asked.is_empty() || asked.iter().any(|name| name == fault.name)).collect();
-    let own = std::env::current_exe().expect("the path of this binary");
-    let server = server_binary(arguments.server.as_ref());
-    let folder = tempfile::tempdir().expect("a folder");
-    let (hub, processes, streams) = (Hub::start(), BTreeMap::new(), Streams::default());
+    let (machines, streams) = (Machines::start(arguments.server.as_ref()), Streams::default());
     let share = arguments.vehicles.div_ceil(3);
     let vehicles =
         [0, 1, 2].map(|index| (index * share..((index + 1) * share).min(arguments.vehicles)).map(name).collect());
     let (seconds, valid_ms) = (arguments.seconds, arguments.valid_ms);
-    let mut bed = Bed { own, server, folder, hub, processes, streams, vehicles, seconds, valid_ms };
-    (0..2).for_each(|index| bed.start_router(index));
+    let mut bed = Bed { machines, streams, vehicles, seconds, valid_ms };
+    (0..2).for_each(|index| bed.machines.start_router(index));
     (0..3).for_each(|index| bed.start_vehicles(index, ""));
     (0..2).for_each(|index| bed.start_planner(index, ""));
     let Some(whole) = bed.whole() else {
@@ -356,8 +283,8 @@ fn faults() -> Vec<Fault> {
             "cut-one",
             "the link of s1 to r1 is cut",
             of[0],
-            |bed| bed.hub.link("s1", "r1", 0, 1.0),
-            |bed| bed.hub.link("s1", "r1", 0, 0.0),
+            |bed| bed.machines.link("s1", "r1", 0, 1.0),
+            |bed| bed.machines.link("s1", "r1", 0, 0.0),
         ),
         fault(
             "cut-planner",
@@ -370,8 +297,8 @@ fn faults() -> Vec<Fault> {
             "cut-routers",
             "the link between the routers is cut",
             no_stream,
-            |bed| bed.hub.link("r1", "r2", 0, 1.0),
-            |bed| bed.hub.link("r1", "r2", 0, 0.0),
+            |bed| bed.machines.link("r1", "r2", 0, 1.0),
+            |bed| bed.machines.link("r1", "r2", 0, 0.0),
         ),
         fault(
             "slow",
@@ -380,12 +307,12 @@ fn faults() -> Vec<Fault> {
             |bed| bed.links("s2", 300, 0.05),
             |bed| bed.links("s2", 0, 0.0),
         ),
-        fault("router", "r1 restarts", no_stream, |bed| bed.stop(&["r1"]), |bed| bed.start_router(0)),
+        fault("router", "r1 restarts", no_stream, |bed| bed.machines.stop(&["r1"]), |bed| bed.machines.start_router(0)),
         fault(
             "moved",
             "s3 restarts at another address",
             of[2],
-            |bed| bed.stop(&["s3 server"]),
+            |bed| bed.machines.stop(&["s3 server"]),
             |bed| {
                 let arguments = ["-n", "s3", "address", "delete", "10.99.0.13/24", "dev", "wire"];
                 assert!(Command::new("ip").args(arguments).status().expect("ip runs").success());
@@ -398,9 +325,9 @@ fn faults() -> Vec<Fault> {
             no_stream,
             |bed| {
                 bed.start_server("p2", "", &[CLAIMED.to_owned()]);
-                bed.start("p2 feed", "p2", "", &["feed", CLAIMED]);
+                bed.machines.start_role("p2 feed", "p2", "", &["feed", CLAIMED]);
             },
-            |bed| bed.stop(&["p2 feed", "p2 server"]),
+            |bed| bed.machines.stop(&["p2 feed", "p2 server"]),
         ),
         fault("server-behind", "the clock of s2 is 2 s behind", of[1], clock_of_s2::<-2>, clock_of_s2::<0>),
         fault("server-ahead", "the clock of s2 is 2 s ahead", of[1], clock_of_s2::<2>, clock_of_s2::<0>),
