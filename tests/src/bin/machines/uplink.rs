@@ -253,7 +253,7 @@ fn parts(folder: &Path) -> BTreeMap<PathBuf, u32> {
     let files = std::fs::read_dir(folder).expect("a folder of ours").flatten().map(|file| file.path());
     let parts = files.filter(|file| file.extension().is_some_and(|extension| extension == "mcap"));
     let finished = parts.filter_map(|file| {
-        let bytes = std::fs::read(&file).ok().filter(|bytes| bytes.ends_with(&mcap::MAGIC))?;
+        let bytes = std::fs::read(&file).ok().filter(|bytes| bytes.ends_with(mcap::MAGIC))?;
         Some((file, crc32fast::hash(&bytes)))
     });
     finished.filter(|(file, _)| !file.with_added_extension("confirmed").exists()).collect()
