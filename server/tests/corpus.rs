@@ -119,6 +119,8 @@ fn plain() -> WriteOptions {
 fn mcap(options: WriteOptions) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     let mut writer = options.create(&mut bytes).unwrap();
+    let metadata = BTreeMap::from([("boot_id".to_owned(), "7".to_owned())]);
+    writer.write_metadata(&mcap::records::Metadata { name: "clearway".into(), metadata }).unwrap();
     let config = Config::of_one_vehicle("car", "top").to_toml();
     let attachment = mcap::Attachment {
         log_time: 0,
