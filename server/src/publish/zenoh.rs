@@ -38,7 +38,7 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 
 use super::ros::Node;
 use super::served::{Served, Vehicles};
-use super::zenoh_pace::{Pace, Probe, Probes};
+use super::zenoh_pace::{Pace, Probe, Probes, REPEAT};
 use crate::config::{Zenoh as Options, ZenohMode, secret};
 use crate::encode::EncodedMap;
 use crate::status::{Reader, Transport, state_changed};
@@ -299,12 +299,20 @@ async fn send_maps(
                     send_map(&map, &publishers, signing_key.as_deref()).await;
                     if let (Some(before), Some(after)) = (before, probe(probes).await) {
                         pace.sent(Instant::now());
-                        on_the_way.push(async { (before.answered().await, after.answered().await) });
+                        on_the_way.push(passed(pace.count(), Some(before), after));
                     }
                 }
             }
-            Some((before, after)) = on_the_way.next() => pace.arrived(Instant::now(), after.duration_since(before)),
-            () = tokio::time::sleep(wait.unwrap_or_default()), if wait.is_some_and(|wait| !wait.is_zero()) => {}
+            Some(passed) = on_the_way.next() => {
+                if let Some((count, transmission)) = passed {
+                    pace.arrived(Instant::now(), count, transmission);
+                }
+            }
+            () = tokio::time::sleep(wait.unwrap_or(REPEAT)), if wait != Some(Duration::ZERO) => {
+                if let (None, Some(again)) = (wait, probe(probes.as_ref()).await) {
+                    on_the_way.push(passed(pace.count(), None, again));
+                }
+            }
             Ok(()) = replay_ended.changed() => {}
         }
         let ended = *replay_ended.borrow();
@@ -315,6 +323,17 @@ async fn send_maps(
     }
     // The engine has stopped, but the current map stays in the caches until the session ends.
     std::future::pending::<()>().await;
+}
+
+/// Waits until the first `count` maps have passed the link: these, and how long it took for the last of them, between
+/// the two probes around it. `None` if a probe is not answered.
+async fn passed(count: u64, before: Option<Probe>, after: Probe) -> Option<(u64, Option<Duration>)> {
+    let before = match before {
+        Some(before) => Some(before.answered().await?),
+        None => None,
+    };
+    let after = after.answered().await?;
+    Some((count, before.map(|before| after.duration_since(before))))
 }
 
 /// Sends a probe of the link, if maps are paced by it.

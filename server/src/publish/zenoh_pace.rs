@@ -18,16 +18,20 @@ use zenoh::sample::Locality;
 use crate::zenoh_session::ZenohError;
 
 /// Maps on the way to the router at the same time. Ours: as a gRPC client asks for (`max_in_flight`).
-const ON_THE_WAY_MAX: usize = 2;
-/// Longest wait for an answer. Ours: longer than any link takes for a map that a planner can use. The end of the
-/// session with a router, after its lease, ends its probes before.
+const ON_THE_WAY_MAX: u64 = 2;
+/// Time without an answer after which another probe is sent, because the last may be lost: a full queue drops it, as it
+/// does maps. Ours: less than the validity of a map, and more than most links take.
+pub(super) const REPEAT: Duration = Duration::from_millis(250);
+/// Longest life of a probe. Ours: longer than any link takes for a map that a planner can use. The end of the session
+/// with a router, after its lease, ends its probes before.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The maps of a vehicle that are on the way to the router.
 #[derive(Debug, Default)]
 pub(super) struct Pace {
-    /// Number of maps on the way.
-    on_the_way: usize,
+    /// Numbers of maps since the start.
+    sent: u64,
+    arrived: u64,
     /// Time that the link took for the last map that arrived.
     transmission: Duration,
     /// When the link has transmitted the maps on the way; `None` before the first map.
@@ -37,21 +41,28 @@ pub(super) struct Pace {
 impl Pace {
     /// Records a map that is sent now.
     pub fn sent(&mut self, now: Instant) {
-        self.on_the_way += 1;
+        self.sent += 1;
         self.free = Some(now + self.transmission);
     }
 
-    /// Records that the oldest map on the way has arrived, for which the link took so long. If another is on the way, it
-    /// may have waited in the queue of the link until now.
-    pub fn arrived(&mut self, now: Instant, transmission: Duration) {
-        self.on_the_way -= 1;
-        self.transmission = transmission;
-        self.free = Some(now + transmission);
+    /// Number of maps that were sent.
+    pub fn count(&self) -> u64 {
+        self.sent
+    }
+
+    /// Records that the first `count` maps have arrived, and how long the link took for the last of them, if that is
+    /// known. If another is on the way, it may have waited in the queue of the link until now.
+    pub fn arrived(&mut self, now: Instant, count: u64, transmission: Option<Duration>) {
+        if count > self.arrived {
+            self.arrived = count;
+            self.transmission = transmission.unwrap_or(self.transmission);
+            self.free = Some(now + self.transmission);
+        }
     }
 
     /// Time from now until the next map may be sent; `None` if one must arrive before.
     pub fn wait(&self, now: Instant) -> Option<Duration> {
-        match self.on_the_way {
+        match self.sent - self.arrived {
             0 => Some(Duration::ZERO),
             1..ON_THE_WAY_MAX => self.free.map(|free| free.saturating_duration_since(now)),
             _ => None,
@@ -81,7 +92,6 @@ impl Probes {
     /// [`ZenohError`] if the session is closed.
     pub async fn send(&self) -> Result<Probe, ZenohError> {
         let query = self.session.get(&self.key).allowed_destination(Locality::Remote).timeout(ANSWER_TIMEOUT);
-        // A full queue drops it, as it does maps; then it ends after the timeout.
         let query = query.priority(self.priority).congestion_control(CongestionControl::Drop);
         // Express: in a batch with the map, which is received as one, it would arrive with the map.
         let query = query.express(true);
@@ -90,10 +100,10 @@ impl Probes {
 }
 
 impl Probe {
-    /// Waits for the answer, which is the end of the query; returns when it came.
-    pub async fn answered(self) -> Instant {
-        while self.0.recv_async().await.is_ok() {}
-        Instant::now()
+    /// Waits for the answer, which is the end of the query without a reply; returns when it came. `None` without an
+    /// answer: a reply says that the time is over.
+    pub async fn answered(self) -> Option<Instant> {
+        self.0.recv_async().await.is_err().then(Instant::now)
     }
 }
 
@@ -120,8 +130,8 @@ mod tests {
         let (mut pace, mut answers, mut free_ms, mut arrived) = (Pace::default(), VecDeque::new(), 0, Vec::new());
         let mut unsent = None;
         for now_ms in 0..made * PERIOD_MS {
-            while let Some((_, transmission)) = answers.pop_front_if(|(at_ms, _)| *at_ms <= now_ms) {
-                pace.arrived(at(now_ms), Duration::from_millis(transmission));
+            while let Some((_, count, transmission)) = answers.pop_front_if(|(at_ms, ..)| *at_ms <= now_ms) {
+                pace.arrived(at(now_ms), count, Some(Duration::from_millis(transmission)));
             }
             if now_ms % PERIOD_MS == 0 {
                 unsent = Some(now_ms / PERIOD_MS);
@@ -132,7 +142,7 @@ mod tests {
                 pace.sent(at(now_ms));
                 let transmission_ms = (link.transmission_ms)(map);
                 free_ms = free_ms.max(now_ms) + transmission_ms;
-                answers.push_back((free_ms + link.trip_ms, transmission_ms));
+                answers.push_back((free_ms + link.trip_ms, pace.count(), transmission_ms));
                 arrived.push((map, free_ms - map * PERIOD_MS));
             }
         }
@@ -164,5 +174,16 @@ mod tests {
         assert!(worst <= Some(2 * 400), "{arrived:?}");
         let later = arrived.iter().filter(|(map, _)| *map >= 60).map(|(_, age_ms)| *age_ms).max();
         assert!(later <= Some(400 + PERIOD_MS), "{arrived:?}");
+    }
+    #[test]
+    fn an_answer_counts_for_the_maps_before_it_whose_answers_are_lost() {
+        let (mut pace, start) = (Pace::default(), Instant::now());
+        pace.sent(start);
+        pace.sent(start);
+        assert_eq!(pace.wait(start), None, "two are on the way");
+        pace.arrived(start, pace.count(), None);
+        assert_eq!(pace.wait(start), Some(Duration::ZERO));
+        pace.arrived(start, 1, None);
+        assert_eq!(pace.wait(start), Some(Duration::ZERO), "a late answer changes nothing");
     }
 }
