@@ -277,9 +277,17 @@ async fn send_maps(
     let (mut pace, mut on_the_way) = (Pace::default(), FuturesUnordered::new());
     let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
     newest.mark_changed();
-    let (mut reported, mut last) = (false, None);
+    let (mut reported, mut last, mut is_silent) = (false, None, false);
     loop {
         let wait = pace.wait(Instant::now());
+        let was_silent = std::mem::replace(&mut is_silent, pace.is_silent(Instant::now()));
+        if is_silent && !was_silent {
+            let key = format!("clearway/{}/link", served.status.name);
+            tracing::warn!(
+                key,
+                "zenoh: maps are sent without pacing: the link is cut, or the router denies this query"
+            );
+        }
         tokio::select! {
             biased;
             changed = newest.changed(), if wait == Some(Duration::ZERO) => {

@@ -20,10 +20,12 @@ use crate::zenoh_session::ZenohError;
 /// Maps on the way to the router at the same time. Ours: as a gRPC client asks for (`max_in_flight`).
 const ON_THE_WAY_MAX: u64 = 2;
 /// Time without an answer after which another probe is sent, because the last may be lost: a full queue drops it, as it
-/// does maps. Ours: less than the validity of a map, and more than most links take.
-pub(super) const REPEAT: Duration = Duration::from_millis(250);
-/// Longest life of a probe. Ours: longer than any link takes for a map that a planner can use. The end of the session
-/// with a router, after its lease, ends its probes before.
+/// does maps. Ours: a lost one delays maps by less than their validity, and probes stay a few percent of a thin link.
+pub(super) const REPEAT: Duration = Duration::from_millis(100);
+/// Time without any answer after which maps are sent without waiting for one, until one comes. Ours: longer than a link
+/// takes for a map that a planner can use. A router whose access control denies the probes delays maps once.
+const SILENCE: Duration = Duration::from_secs(2);
+/// Longest life of a probe. The end of the session with a router, after its lease, ends its probes before.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The maps of a vehicle that are on the way to the router.
@@ -36,6 +38,8 @@ pub(super) struct Pace {
     transmission: Duration,
     /// When the link has transmitted the maps on the way; `None` before the first map.
     free: Option<Instant>,
+    /// Time of the last answer, or of the first map after it; `None` while no map is on the way.
+    unanswered_since: Option<Instant>,
 }
 
 impl Pace {
@@ -43,6 +47,7 @@ impl Pace {
     pub fn sent(&mut self, now: Instant) {
         self.sent += 1;
         self.free = Some(now + self.transmission);
+        self.unanswered_since.get_or_insert(now);
     }
 
     /// Number of maps that were sent.
@@ -57,12 +62,19 @@ impl Pace {
             self.arrived = count;
             self.transmission = transmission.unwrap_or(self.transmission);
             self.free = Some(now + self.transmission);
+            self.unanswered_since = Some(now).filter(|_| self.sent > count);
         }
+    }
+
+    /// True if no probe has been answered for long, although maps were sent.
+    pub fn is_silent(&self, now: Instant) -> bool {
+        self.unanswered_since.is_some_and(|since| now.saturating_duration_since(since) >= SILENCE)
     }
 
     /// Time from now until the next map may be sent; `None` if one must arrive before.
     pub fn wait(&self, now: Instant) -> Option<Duration> {
         match self.sent - self.arrived {
+            _ if self.is_silent(now) => Some(Duration::ZERO),
             0 => Some(Duration::ZERO),
             1..ON_THE_WAY_MAX => self.free.map(|free| free.saturating_duration_since(now)),
             _ => None,
@@ -130,7 +142,8 @@ mod tests {
         let (mut pace, mut answers, mut free_ms, mut arrived) = (Pace::default(), VecDeque::new(), 0, Vec::new());
         let mut unsent = None;
         for now_ms in 0..made * PERIOD_MS {
-            while let Some((_, count, transmission)) = answers.pop_front_if(|(at_ms, ..)| *at_ms <= now_ms) {
+            let is_due = |answer: &mut (u64, u64, u64)| answer.0 <= now_ms;
+            while let Some((_, count, transmission)) = answers.pop_front_if(is_due) {
                 pace.arrived(at(now_ms), count, Some(Duration::from_millis(transmission)));
             }
             if now_ms % PERIOD_MS == 0 {
@@ -175,6 +188,28 @@ mod tests {
         let later = arrived.iter().filter(|(map, _)| *map >= 60).map(|(_, age_ms)| *age_ms).max();
         assert!(later <= Some(400 + PERIOD_MS), "{arrived:?}");
     }
+
+    #[test]
+    fn a_router_that_answers_no_probe_delays_maps_once() {
+        let (start, mut pace) = (Instant::now(), Pace::default());
+        let at = |ms: u64| start + Duration::from_millis(ms);
+        let sent: Vec<u64> = (0..1000)
+            .map(|map| map * PERIOD_MS)
+            .filter(|now_ms| {
+                let is_sent = pace.wait(at(*now_ms)) == Some(Duration::ZERO);
+                if is_sent {
+                    pace.sent(at(*now_ms));
+                }
+                is_sent
+            })
+            .collect();
+        assert_eq!((sent[..3].to_vec(), sent.len()), (vec![0, 100, 2000], 2 + 980));
+        pace.arrived(at(100_000), pace.count(), None);
+        pace.sent(at(100_000));
+        pace.sent(at(100_000));
+        assert_eq!(pace.wait(at(100_100)), None, "after an answer maps are paced again");
+    }
+
     #[test]
     fn an_answer_counts_for_the_maps_before_it_whose_answers_are_lost() {
         let (mut pace, start) = (Pace::default(), Instant::now());
