@@ -20,8 +20,8 @@ use crate::zenoh_session::ZenohError;
 /// Maps on the way to the router at the same time. Ours: as a gRPC client asks for (`max_in_flight`).
 const ON_THE_WAY_MAX: u64 = 2;
 /// Time without an answer after which another probe is sent, because the last may be lost: a full queue drops it, as it
-/// does maps. Ours: less than the validity of a map, and more than most links take.
-pub(super) const REPEAT: Duration = Duration::from_millis(250);
+/// does maps. Ours: a lost one delays maps by less than their validity, and probes stay a few percent of a thin link.
+pub(super) const REPEAT: Duration = Duration::from_millis(100);
 /// Longest life of a probe. Ours: longer than any link takes for a map that a planner can use. The end of the session
 /// with a router, after its lease, ends its probes before.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
