@@ -34,19 +34,29 @@ pub fn binaries() -> &'static PathBuf {
     BINARIES.get_or_init(|| {
         let test = std::env::current_exe().expect("the path of this test");
         let folder = test.ancestors().nth(2).expect("target/<profile>/deps/<test>").to_path_buf();
-        let mut cargo = Command::new(env!("CARGO"));
+        let mut cargo = cargo();
         // The same build as `cargo test --workspace`, so that nothing is built twice.
         cargo.args(["test", "--quiet", "--workspace", "--no-run", "--target-dir"]);
         cargo.arg(folder.parent().expect("target"));
         if folder.ends_with("release") {
             cargo.arg("--release");
         }
-        // Cargo has set it for this test. A build script that reads it would run again, and half of all crates with it.
-        cargo.env_remove("CARGO_MANIFEST_DIR");
-        let built = cargo.current_dir(workspace()).output().expect("cargo runs");
+        let built = cargo.output().expect("cargo runs");
         assert!(built.status.success(), "cargo test --no-run: {}", String::from_utf8_lossy(&built.stderr));
         folder
     })
+}
+
+/// A build in the folder of the repository, without what cargo has set for the program that runs it: a build script that
+/// reads the name or the folder of the package would run again, and half of all crates with it.
+pub fn cargo() -> Command {
+    let mut cargo = Command::new(env!("CARGO"));
+    let of_package = |name: &str| name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_");
+    for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_str().is_some_and(of_package)) {
+        cargo.env_remove(name);
+    }
+    cargo.current_dir(workspace());
+    cargo
 }
 
 /// The folder of the repository.

@@ -68,15 +68,13 @@ fn main() -> ExitCode {
 fn build() -> PathBuf {
     let own = std::env::current_exe().expect("the path of this binary");
     let folder = own.parent().expect("target/<profile>");
-    let mut cargo = Command::new(env!("CARGO"));
+    let mut cargo = clearway_tests::cargo();
     cargo.args(["build", "--quiet", "--workspace", "--bin", "clearway", "--target-dir"]);
     cargo.arg(folder.parent().expect("target"));
     if folder.ends_with("release") {
         cargo.arg("--release");
     }
-    // `cargo run` has set it. A build script that reads it would run again, and half of all crates with it.
-    cargo.env_remove("CARGO_MANIFEST_DIR");
-    let built = cargo.current_dir(clearway_tests::workspace()).status().expect("cargo runs");
+    let built = cargo.status().expect("cargo runs");
     assert!(built.success(), "cargo build: {built}");
     folder.join("clearway")
 }
