@@ -47,8 +47,8 @@ pub fn binaries() -> &'static PathBuf {
     })
 }
 
-/// A build in the folder of the repository, without what cargo has set for the program that runs it: a build script that
-/// reads the name or the folder of the package would run again, and half of all crates with it.
+/// A build in the folder of the repository, without what cargo has set for the program that runs it. A build script
+/// that reads the name or the folder of the package would run again, and half of all crates with it.
 pub fn cargo() -> Command {
     let mut cargo = Command::new(env!("CARGO"));
     let of_package = |name: &str| name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_");

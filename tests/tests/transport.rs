@@ -108,7 +108,9 @@ async fn maps_as_live_are_the_recorded_ones_moved_by_one_constant_until_the_end(
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 12).await;
     let (ready, again) = (folder.path().join("ready.json"), folder.path().join("again.mcap"));
-    std::fs::write(&ready, "{\"pid\": 1}").unwrap();
+    // As a replay that was killed has left it; no process has this number.
+    let left = r#"{"pid": 4194305, "grpc": null, "page": null, "zenoh": [], "foxglove": null, "vehicles": []}"#;
+    std::fs::write(&ready, left).unwrap();
     let options = Options {
         as_live: true,
         exit_at_end: true,
