@@ -108,9 +108,8 @@ async fn maps_as_live_are_the_recorded_ones_moved_by_one_constant_until_the_end(
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 12).await;
     let (ready, again) = (folder.path().join("ready.json"), folder.path().join("again.mcap"));
-    // As a replay that was killed has left it; no process has this number.
-    let left = r#"{"pid": 4194305, "grpc": null, "page": null, "zenoh": [], "foxglove": null, "vehicles": []}"#;
-    std::fs::write(&ready, left).unwrap();
+    // As a replay that was killed has left it: no process has this number.
+    std::fs::write(&ready, r#"{"pid":4194305,"grpc":0,"page":0,"zenoh":[],"foxglove":0,"vehicles":[]}"#).unwrap();
     let options = Options {
         as_live: true,
         exit_at_end: true,
