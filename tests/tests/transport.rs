@@ -378,7 +378,6 @@ async fn in_lockstep_the_next_map_is_made_when_the_client_has_handled_the_last()
     .await;
     assert!(summary.unwrap().reached_end);
     assert_eq!(sequences.unwrap(), (0..maps).collect::<Vec<_>>());
-
     // A client that never asks for the next map still handles the first, although it has arrived.
     let options = Options { lockstep_timeout: Some(0.2), ..options };
     let (summary, _) = replayed(options, async |address| {
