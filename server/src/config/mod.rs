@@ -251,7 +251,8 @@ impl Config {
             "[[vehicle]]\nname = {vehicle:?}\n[[vehicle.sensor]]\nname = {sensor:?}\n[vehicle.sensor.extrinsics]\n\
              x_m = 0.0\ny_m = 0.0\nz_m = 2.0\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n"
         );
-        toml::from_str(&text).expect("a name and extrinsics are all that has no default")
+        let table = toml::from_str(&text).expect("the text is TOML");
+        read::from_table(&table).expect("a name and extrinsics are all that has no default")
     }
 
     /// The configuration as TOML, with every default.

@@ -4,7 +4,11 @@
 
 use serde::de::DeserializeOwned;
 use serde_path_to_error::{Path, Segment};
+use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
+
+/// What a document refused, and where.
+type Error = serde_path_to_error::Error<toml::de::Error>;
 
 /// Keys that hold a list of tables, without the indices of the lists.
 const LISTS: [&str; 2] = ["vehicle", "vehicle.sensor"];
@@ -36,9 +40,7 @@ pub(super) enum Problem {
 /// # Errors
 /// [`Refusal`] for the first key or value that is not allowed.
 pub(super) fn from_text<T: DeserializeOwned>(text: &str, table: &Table) -> Result<T, Refusal> {
-    let none = |_| Refusal { key: String::new(), problem: Problem::Missing, at: None };
-    let document = toml::Deserializer::parse(text).map_err(none)?;
-    serde_path_to_error::deserialize(document).map_err(|error| refusal(error.path(), error.inner(), table))
+    read(table).map_err(|error| Refusal { at: position(text, &error), ..refusal(&error, table) })
 }
 
 /// Reads a table.
@@ -46,8 +48,12 @@ pub(super) fn from_text<T: DeserializeOwned>(text: &str, table: &Table) -> Resul
 /// # Errors
 /// [`Refusal`] for the first key or value that is not allowed.
 pub(super) fn from_table<T: DeserializeOwned>(table: &Table) -> Result<T, Refusal> {
-    let document = Value::Table(table.clone());
-    serde_path_to_error::deserialize(document).map_err(|error| refusal(error.path(), error.inner(), table))
+    read(table).map_err(|error| refusal(&error, table))
+}
+
+/// Texts are read as tables too, because each further kind of document would compile the whole configuration again.
+fn read<T: DeserializeOwned>(table: &Table) -> Result<T, Error> {
+    serde_path_to_error::deserialize(Value::Table(table.clone()))
 }
 
 /// The path of a key without the indices of lists and the names of vehicles: `vehicle.sensor.rpm` of
@@ -57,24 +63,59 @@ pub(super) fn plain_key(key: &str) -> String {
     key.split('.').map(|part| part.split('[').next().unwrap_or(part)).collect::<Vec<_>>().join(".")
 }
 
-fn refusal(path: &Path, error: &toml::de::Error, table: &Table) -> Refusal {
-    let (message, at) = (error.message(), error.span().map(|span| span.start));
-    let (mut keys, value) = follow(path, table);
-    let name = |start: &str| message.strip_prefix(start).and_then(|rest| rest.split('`').next());
-    let problem = if let Some(unknown) = name("unknown field `") {
+/// The text of a message of serde between the backticks after `start`.
+fn named<'a>(message: &'a str, start: &str) -> Option<&'a str> {
+    message.strip_prefix(start).and_then(|rest| rest.split('`').next())
+}
+
+const UNKNOWN: &str = "unknown field `";
+
+fn refusal(error: &Error, table: &Table) -> Refusal {
+    let message = error.inner().message();
+    let (mut keys, value) = follow(error.path(), table);
+    let problem = if let Some(unknown) = named(message, UNKNOWN) {
         if keys.last() != Some(unknown) {
             keys.push(unknown);
         }
         Problem::Unknown { known: quoted(message).skip(1).collect::<Vec<_>>().join(", ") }
-    } else if let Some(missing) = name("missing field `") {
+    } else if let Some(missing) = named(message, "missing field `") {
         keys.push(missing);
         Problem::Missing
     } else if let Some((list, allowed)) = wrong_brackets(&keys.plain(), table) {
-        return Refusal { key: list, problem: Problem::Value { value: "(a table)".into(), allowed }, at };
+        return Refusal { key: list, problem: Problem::Value { value: "(a table)".into(), allowed }, at: None };
     } else {
         Problem::Value { value: value.map_or("(nothing)".into(), shown), allowed: allowed(message, &keys.plain()) }
     };
-    Refusal { key: keys.to_string(), problem, at }
+    Refusal { key: keys.to_string(), problem, at: None }
+}
+
+/// Where the refused key stands in the text, in bytes, or the table in which it is missing.
+fn position(text: &str, error: &Error) -> Option<usize> {
+    let document = DeTable::parse(text).ok()?;
+    let mut at = document.span().start;
+    let mut here = DeValue::Table(document.into_inner());
+    let unknown = named(error.inner().message(), UNKNOWN);
+    let segments = error.path().iter().map(|segment| match segment {
+        Segment::Seq { index } => (None, *index),
+        Segment::Map { key } => (Some(key.as_str()), 0),
+        Segment::Enum { .. } | Segment::Unknown => (None, usize::MAX),
+    });
+    for (key, index) in segments.chain([(unknown, usize::MAX)]) {
+        let (start, inner) = match (here, key) {
+            (DeValue::Table(table), Some(key)) => {
+                let mut keys = table.into_iter();
+                let Some((name, value)) = keys.find(|(name, _)| name.get_ref() == key) else { break };
+                (name.span().start, value)
+            }
+            (DeValue::Array(items), None) => {
+                let Some(item) = items.into_iter().nth(index) else { break };
+                (item.span().start, item)
+            }
+            _ => break,
+        };
+        (at, here) = (start, inner.into_inner());
+    }
+    Some(at)
 }
 
 /// The parts of a key's path.
