@@ -4,12 +4,13 @@
 //! The threads do nothing else and never wait for an engine. If an engine does not keep up, readings are lost at its
 //! event queue, which counts them, and not in the kernel's buffer.
 //!
-//! To wake a thread costs more than to read a datagram. So a thread that has read datagrams faster than one a [`PAUSE`]
-//! reads again after a pause, and the kernel keeps and stamps what arrives meanwhile.
+//! To wake a thread costs more than to read a datagram. So a thread that has read datagrams faster than one a pause
+//! ([`pause`]) reads again after a pause, and the kernel keeps and stamps what arrives meanwhile.
 
 use std::collections::BTreeSet;
 use std::io::{self, PipeReader, PipeWriter};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::ops::RangeInclusive;
 use std::os::fd::AsFd;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -25,9 +26,13 @@ use crate::ingest::queue::{EventQueue, QueueClosedError};
 
 mod receive;
 
-/// Time between two reads of a socket whose datagrams come faster. Ours: a map is that much later at most, and the
-/// threads of an HDL-64E wake a third as often.
-const PAUSE: Duration = Duration::from_millis(1);
+/// Least and greatest time between two reads of a socket whose datagrams come faster. Ours: a map is that much later at
+/// most. After 1 ms the threads of one HDL-64E wake a third as often; after 4 ms its kernel buffer holds a sixth of what
+/// the kernel's own default allows.
+const PAUSE_MS: RangeInclusive<u32> = 1..=4;
+/// Number of sockets of which each further one lengthens the pause by a millisecond. Ours: four vehicles with sockets
+/// for packets and for telemetry; then the threads of all sockets wake 4,000 times a second, however many there are.
+const SOCKETS_A_MS: u32 = 8;
 
 pub use receive::{BATCH, DATAGRAM_BYTES_MAX, Received, Receiver};
 
@@ -77,13 +82,14 @@ impl Sockets {
     /// [`io::Error`] if the system cannot create a thread or pipe.
     pub fn start(self, queues: &[EventQueue]) -> io::Result<UdpThreads> {
         let (stopped, stop) = io::pipe()?;
+        let pause = pause(self.0.len());
         let mut threads = Vec::new();
         for (socket, at, listener) in self.0 {
             let (queues, stopped) = (queues.to_vec(), stopped.try_clone()?);
             let run = move || {
                 let mut watch =
                     ThreadWatch { at, listener: &listener, queues: &queues, fault: Some("it panicked".into()) };
-                watch.fault = receive(socket, &listener, &queues, &stopped).err().map(|error| error.to_string());
+                watch.fault = receive(socket, &listener, &queues, &stopped, pause).err().map(|error| error.to_string());
             };
             threads.push(std::thread::Builder::new().name(format!("udp {}", at.port())).spawn(run)?);
         }
@@ -187,8 +193,20 @@ fn join_group(socket: &Socket, group: IpAddr, interface: &str) -> io::Result<()>
     }
 }
 
+/// Time between two reads of a socket whose datagrams come faster, in a server with so many sockets.
+fn pause(sockets: usize) -> Duration {
+    let ms = u32::try_from(sockets).unwrap_or(u32::MAX) / SOCKETS_A_MS;
+    Duration::from_millis(ms.clamp(*PAUSE_MS.start(), *PAUSE_MS.end()).into())
+}
+
 /// Reads one socket until the other end of `stopped` is closed, or until all engines behind the socket have stopped.
-fn receive(socket: Socket, listener: &Listener, queues: &[EventQueue], stopped: &PipeReader) -> io::Result<()> {
+fn receive(
+    socket: Socket,
+    listener: &Listener,
+    queues: &[EventQueue],
+    stopped: &PipeReader,
+    pause: Duration,
+) -> io::Result<()> {
     let mut receiver = Receiver::new(socket)?;
     let mut batches: Vec<VehicleBatch> = Vec::new();
     for route in &listener.routes {
@@ -216,11 +234,11 @@ fn receive(socket: Socket, listener: &Listener, queues: &[EventQueue], stopped: 
         if batches.is_empty() {
             return Ok(());
         }
-        let is_fast = read > 1 || last_read.is_some_and(|last| last.elapsed() < PAUSE);
+        let is_fast = read > 1 || last_read.is_some_and(|last| last.elapsed() < pause);
         last_read = Some(Instant::now());
         // After a whole batch more datagrams may wait.
         if is_fast && read < BATCH {
-            std::thread::sleep(PAUSE);
+            std::thread::sleep(pause);
         }
     }
     for batch in batches {
@@ -281,6 +299,12 @@ mod tests {
     use super::*;
     use crate::config::{Config, Udp};
     use crate::ingest::queue::event_queue;
+
+    #[test]
+    fn many_sockets_are_read_less_often() {
+        let ms = [1, 2, 8, 16, 31, 32, 1000].map(|sockets| pause(sockets).as_millis());
+        assert_eq!(ms, [1, 1, 1, 2, 3, 4, 4]);
+    }
 
     #[test]
     fn a_thread_that_ends_by_a_fault_is_known_to_its_vehicles() {

@@ -4,6 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::check::{ConfigValueError, check_cells, check_each, check_fits};
 
+use super::flicker::MAPS_MAX;
+
 /// Parameters of the layer `occupancy`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -46,6 +48,11 @@ pub struct OccupancyConfig {
     /// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
     /// that no sensor sees again leaves the third map; not tuned.
     pub hold_maps: u8,
+    /// With `variant = "polar"` and ego poses: number of maps in which a cell that was clear, and then was neither clear
+    /// nor occupied, does not become clear again; and a hidden cell becomes clear only in the second map in a row that
+    /// shows it clear. 0: both do at once. 5 is ours: of the changes along the borders of shadows half are undone within
+    /// five maps; not tuned.
+    pub calm_maps: u8,
     /// What the channel `hits` contains. `reduced` is ours, because it costs fewer bytes (BENCHMARKS.md has the sizes);
     /// `counted` is the paper's (section 2).
     pub hits: Hits,
@@ -89,6 +96,7 @@ impl Default for OccupancyConfig {
             hits_slow: 20,
             hits_fast: 2,
             hold_maps: 2,
+            calm_maps: 5,
             hits: Hits::Reduced,
         }
     }
@@ -115,6 +123,7 @@ impl OccupancyConfig {
             ("hits_slow", self.hits_slow.into(), (1.0..=255.0, "1 to 255")),
             ("hits_fast", self.hits_fast.into(), (1.0..=255.0, "1 to 255")),
             ("hold_maps", self.hold_maps.into(), (0.0..=100.0, "0 to 100")),
+            ("calm_maps", self.calm_maps.into(), (0.0..=f64::from(MAPS_MAX), "0 to 7")),
         ];
         check_each(at, values)?;
         check_fits(at, "overhang_m", self.overhang_m, self.overhang_m > self.clearance_m, "more than clearance_m")?;

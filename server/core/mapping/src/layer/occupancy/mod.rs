@@ -9,6 +9,7 @@
 //! | a square that scrolls with the vehicle | section 2 ("ScrollingByteMap") | [`window`] |
 //! | rays -> hits, and -> evidence along rays, outward | algorithm 1 | [`lines`]; [`polar_scan`], [`ray`] |
 //! | evidence -> states; hits fade | figure 4 | [`states`] |
+//! | cells at the border of a shadow do not flicker | not in the paper | [`flicker`] |
 //! | number of hits that make a cell occupied | figure 5 | [`Occupancy::hits_needed`] |
 //!
 //! There are two variants ([`OccupancyVariant`]): `paper` traces a line for each return, as published; `polar` differs:
@@ -33,6 +34,7 @@ mod azimuth_bins;
 mod bits;
 pub mod class;
 pub mod config;
+pub mod flicker;
 pub mod lines;
 pub mod polar_scan;
 pub mod ray;
@@ -47,6 +49,7 @@ use crate::sensor::sweep::Sweep;
 
 use class::{HITS, OccupancyClass};
 use config::{OccupancyConfig, OccupancyVariant};
+use flicker::Flicker;
 use lines::Lines;
 use polar_scan::PolarScans;
 use window::Window;
@@ -57,6 +60,7 @@ pub struct Occupancy {
     config: OccupancyConfig,
     window: Window,
     scans: Scans,
+    flicker: Flicker,
     /// Forward speed at the newest scan, m/s, if known.
     speed_mps: Option<f64>,
 }
@@ -99,6 +103,7 @@ impl Occupancy {
                 }
                 OccupancyVariant::Paper => Scans::Paper(Lines::default()),
             },
+            flicker: Flicker::new(side, config.calm_maps),
             speed_mps: None,
         }
     }
@@ -141,6 +146,9 @@ impl Occupancy {
         };
         let limits = [needed, self.config.hold_maps];
         self.window.update_states(limits, any, self.config.hits, &mut class, &mut hits);
+        if self.window.anchored() && self.config.variant == OccupancyVariant::Polar {
+            self.flicker.calm(self.window.corner(), &mut class);
+        }
         let share = |of: OccupancyClass| count_cells(&class, of.value()) as f64 / cells as f64;
         layer.metrics.extend([
             ("clear_share", share(OccupancyClass::Clear)),
@@ -176,6 +184,7 @@ impl LayerMaker for Occupancy {
         self.speed_mps = rays.speed_mps;
         if !self.window.move_to(rays.map_from_ego.as_ref()) {
             self.scans.clear();
+            self.flicker.clear();
         }
         self.scans.insert(rays, &self.config, &mut self.window);
     }
