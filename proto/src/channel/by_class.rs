@@ -106,10 +106,12 @@ fn majorities<T: Cell>(cells: &[T], class: &[u8], classes: usize) -> Vec<T> {
     majorities.into_iter().map(|(value, _)| value).collect()
 }
 
-/// The value of a block of equal values; `None` if they differ. It has no branches, so that the compiler vectorises it.
+/// The value of a block of equal values; `None` if they differ.
+#[inline(always)]
 fn equal_value<T: Copy + PartialEq>(block: &[T; BLOCK]) -> Option<T> {
     let first = block[0];
-    block.iter().fold(true, |equal, value| equal & (*value == first)).then_some(first)
+    // Arrays are compared as vectors.
+    (*block == [first; BLOCK]).then_some(first)
 }
 
 /// The base of a channel with a class table: the table's value for each cell's class. `class`: the cells of channel
