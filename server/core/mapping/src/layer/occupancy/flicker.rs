@@ -58,24 +58,22 @@ impl Flicker {
         }
         let known = self.corner.replace(corner);
         let is_slow = known.is_some_and(|known| (0..2).all(|axis| known[axis].abs_diff(corner[axis]) <= MOVED_MAX));
-        for (iy, row) in (0..).zip(class.chunks_exact_mut(self.side)) {
-            let y = corner[1] + iy;
-            let is_known = |at: i64, axis: usize| {
-                known.is_some_and(|known| (known[axis]..known[axis] + self.side as i64).contains(&at))
-            };
-            let is_row_known = is_known(y, 1);
+        for (y, row) in (corner[1]..).zip(class.chunks_exact_mut(self.side)) {
             let mask = (1_i64 << self.bits) - 1;
             let stored = &mut self.cells[((y & mask) as usize) << self.bits..][..1 << self.bits];
+            let is_row_known = known.is_some_and(|known| (known[1]..known[1] + self.side as i64).contains(&y));
             // The row is stored in one piece, or in two.
             let first = (corner[0] & mask) as usize;
             let (head, tail) = row.split_at_mut(self.side.min(stored.len() - first));
             let tail_x = corner[0] + head.len() as i64;
-            let pieces = [(corner[0], first, head), (tail_x, 0, tail)];
-            for (x, at, states) in pieces {
+            for (x, at, states) in [(corner[0], first, head), (tail_x, 0, tail)] {
                 let stored = &mut stored[at..at + states.len()];
                 // Cells that were not in the last map's window have no history.
-                let new = (0..).zip(&mut *stored).filter(|(i, _)| !is_row_known || !is_known(x + i, 0));
-                new.for_each(|(_, cell)| *cell = 0);
+                let known_x = known.filter(|_| is_row_known).map_or(i64::MAX, |known| known[0]);
+                let [from, to] = [known_x, known_x.saturating_add(self.side as i64)]
+                    .map(|known_x| known_x.saturating_sub(x).clamp(0, stored.len() as i64) as usize);
+                stored[..from].fill(0);
+                stored[to..].fill(0);
                 for (cell, state) in stored.iter_mut().zip(states) {
                     let (later, calmed) = next(*cell, *state, self.maps);
                     (*cell, *state) = (later, if is_slow { calmed } else { *state });
