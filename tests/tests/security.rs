@@ -306,3 +306,45 @@ async fn readers_with_the_public_key_believe_the_server_that_signs() {
     car.halt();
     within("shutdown", running.shutdown()).await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn what_a_peer_publishes_on_a_wildcard_over_the_servers_keys_reaches_nobody() {
+    let mut config = config();
+    config.zenoh.enabled = true;
+    let running = fixture::start(config).await;
+    let session = async || {
+        let mut config = zenoh::Config::default();
+        let endpoint = format!("[{:?}]", running.zenoh[0]);
+        let settings =
+            [("mode", "\"client\""), ("connect/endpoints", &endpoint), ("scouting/multicast/enabled", "false")];
+        settings.iter().for_each(|(key, value)| config.insert_json5(key, value).unwrap());
+        within("zenoh", zenoh::open(config).into_future()).await.unwrap()
+    };
+    let (attacker, observer) = (session().await, session().await);
+    let seen = observer.declare_subscriber("clearway/**").await.unwrap();
+    let others = "clearway/van/map/drivability";
+    within("the server routes to the observer", async {
+        while let Ok(None) = seen.try_recv() {
+            attacker.put(others, "of another vehicle").await.unwrap();
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    // The last is no key of the server's.
+    let forged = ["clearway/**", "clearway/*/map/*", "**", "clearway/car/map/drivability", "clearway/*/status"];
+    for key in forged.into_iter().chain(["clearway/van/end"]) {
+        attacker.put(key, "forged").await.unwrap();
+    }
+    let mut arrived = Vec::new();
+    while arrived.last().is_none_or(|key| key != "clearway/van/end") {
+        let sample = within("the last", seen.recv_async().into_future()).await.unwrap();
+        if *sample.payload().to_bytes() == *b"forged" {
+            arrived.push(sample.key_expr().to_string());
+        }
+    }
+    assert_eq!(arrived, ["clearway/van/end"]);
+    for session in [attacker, observer] {
+        session.close().await.unwrap();
+    }
+    within("shutdown", running.shutdown()).await.unwrap();
+}
