@@ -71,8 +71,10 @@ pub(crate) async fn open(
 ) -> Result<Session, ZenohError> {
     let mut config = session_config(options, MESSAGE_BYTES_MAX.max(2 * observation_bytes_max))?;
     if config.get_json("access_control/enabled").is_ok_and(|enabled| enabled != "true") {
-        let own_keys = own_keys(vehicles).to_string();
-        config.insert_json5("access_control", &own_keys).map_err(ZenohError::of("access_control"))?;
+        let own_keys = own_keys(vehicles);
+        for (key, value) in [("access_control", deny_put(&own_keys)), ("downsampling", drop_put(&own_keys))] {
+            config.insert_json5(key, &value.to_string()).map_err(ZenohError::of(key))?;
+        }
     }
     let endpoints = options.listen.join(", ");
     zenoh::open(config).await.map_err(ZenohError::of(format!("open (listen {endpoints})")))
@@ -132,14 +134,18 @@ fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config,
     Ok(config)
 }
 
-/// Access control under which peers may do everything but publish on the keys on which the server publishes. zenoh lets
-/// a publication on a key with wildcards through; Clearway's clients pass over it.
-fn own_keys<'a>(vehicles: impl Iterator<Item = &'a str>) -> serde_json::Value {
+/// The keys on which the server publishes.
+fn own_keys<'a>(vehicles: impl Iterator<Item = &'a str>) -> Vec<String> {
     let keys = |vehicle| {
         ["", "/status", "/ingest/report", "/replay", "/map/**", "/map/*/@adv/**", "/recorder/*"]
             .map(|rest| format!("clearway/{vehicle}{rest}"))
     };
-    let keys: Vec<_> = vehicles.flat_map(keys).collect();
+    vehicles.flat_map(keys).collect()
+}
+
+/// Access control under which peers may do everything but publish on these keys. It lets a publication on a key with
+/// wildcards through, which [`drop_put`] drops.
+fn deny_put(keys: &[String]) -> serde_json::Value {
     serde_json::json!({
         "enabled": true,
         "default_permission": "allow",
@@ -150,6 +156,15 @@ fn own_keys<'a>(vehicles: impl Iterator<Item = &'a str>) -> serde_json::Value {
         "subjects": [{ "id": "every peer" }],
         "policies": [{ "rules": ["publish as the server"], "subjects": ["every peer"] }],
     })
+}
+
+/// Downsampling to nothing of what peers publish on keys that match one of these, such as `clearway/**`: before it is
+/// routed, so that a flood of it costs no reader anything.
+fn drop_put(keys: &[String]) -> serde_json::Value {
+    let rules: Vec<_> = keys.iter().map(|key| serde_json::json!({ "key_expr": key, "freq": 0.0 })).collect();
+    serde_json::json!([{
+        "id": "publish as the server", "messages": ["put", "delete"], "flows": ["ingress"], "rules": rules,
+    }])
 }
 
 /// zenoh's default settings with [`LIMITS`].

@@ -1,8 +1,11 @@
 //! A path -> an open file, or an error that says what is wrong with the file, and what to do.
 
 use std::fs::File;
-use std::io::{Error, ErrorKind};
+use std::io::{Error, ErrorKind, Read};
 use std::path::Path;
+
+/// Longest file of a configuration, a certificate or a calibration, in bytes. Ours: a thousand vehicles have 2 MB.
+const TEXT_BYTES_MAX: u64 = 16 << 20;
 
 /// Opens a file that is read more than once. A pipe or a device is refused, before its opening can wait for a writer.
 ///
@@ -11,10 +14,24 @@ use std::path::Path;
 pub fn open_to_read(file: &Path) -> Result<File, Error> {
     let metadata = file.metadata()?;
     if !metadata.is_file() && !metadata.is_dir() {
-        let advice = "this is a pipe or a device, and the data is read more than once; save it to a file first";
+        let advice = "this is a pipe or a device, and it may be read more than once; save it to a file first";
         return Err(Error::new(ErrorKind::InvalidInput, advice));
     }
     File::open(file)
+}
+
+/// The text of a file of a few kilobytes, such as a configuration: a server that runs reads it again, and must neither
+/// wait for a pipe nor use much memory.
+///
+/// # Errors
+/// As [`open_to_read`]; [`ErrorKind::FileTooLarge`] for more than 16 MiB; [`ErrorKind::InvalidData`] if it is no UTF-8.
+pub fn read_text(file: &Path) -> Result<String, Error> {
+    let mut text = String::new();
+    open_to_read(file)?.take(TEXT_BYTES_MAX + 1).read_to_string(&mut text)?;
+    match text.len() as u64 > TEXT_BYTES_MAX {
+        true => Err(Error::new(ErrorKind::FileTooLarge, "it has more than 16 MiB; less is allowed")),
+        false => Ok(text),
+    }
 }
 
 /// The error of `file`, which could not be read or created, with a text that says what is wrong and what to do. The
@@ -59,6 +76,10 @@ mod tests {
         assert!(read(&at("no/absent")).contains("the folder") && read(&at("no/absent")).contains("does not exist"));
         assert_eq!(read(folder.path()), "this is a folder; name a file");
         assert!(read(&at("there/in")).contains("where a folder is needed"));
+        fs::write(at("long"), vec![b'#'; TEXT_BYTES_MAX as usize + 1]).unwrap();
+        let long = advice(&at("long"), read_text(&at("long")).map(drop));
+        assert_eq!(long, "it has more than 16 MiB; less is allowed");
+        assert!(advice(Path::new("/dev/zero"), read_text(Path::new("/dev/zero")).map(drop)).contains("a device"));
         let exists = advice(&at("there"), File::create_new(at("there")).map(drop));
         assert_eq!(exists, "the file exists and is not overwritten; delete it, or name another file");
     }

@@ -10,9 +10,9 @@ use super::error::ValueError;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Connections {
-    /// Most connections of one address at once, at each listener.
+    /// Most connections of one address at once, at each listener. IPv6: of one network with a prefix of 64 bits.
     pub per_address_max: usize,
-    /// Connections of each listener that only known peers may use.
+    /// Connections and calls of each listener that only known peers may use.
     pub kept: usize,
     /// Addresses that are known peers; so are the names in certificates and tokens that have a role.
     pub known: Vec<IpAddr>,

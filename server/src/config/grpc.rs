@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::base::file_advice::advised;
+use crate::base::file_advice::{advised, read_text};
 
 use super::error::{ConfigError, ValueError, beside};
 
@@ -170,7 +170,7 @@ fn wrong(file: &Path, key: String, named: PathBuf, reason: String) -> ConfigErro
 }
 
 fn text(file: &Path) -> Result<String, String> {
-    std::fs::read_to_string(file).map_err(|error| advised(file, error).to_string())
+    read_text(file).map_err(|error| advised(file, error).to_string())
 }
 
 /// The parts of `HOST`, `HOST:PORT` or `[IPV6]:PORT`.

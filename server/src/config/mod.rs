@@ -12,7 +12,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::base::file_advice::advised;
+use crate::base::file_advice::{advised, read_text};
 use error::{ValueError, beside};
 use layers::Layers;
 use overrides::{blamed, matching, set};
@@ -334,7 +334,7 @@ impl Config {
                 named: path.clone(),
                 reason,
             };
-            let text = std::fs::read_to_string(&path).map_err(|error| wrong(advised(&path, error).to_string()))?;
+            let text = read_text(&path).map_err(|error| wrong(advised(&path, error).to_string()))?;
             let table = Calibration::load_str(&text).map_err(|error| wrong(error.to_string()))?;
             if let Some(model) = sensor.model {
                 table.fits(model).map_err(|error| wrong(error.to_string()))?;
@@ -346,8 +346,7 @@ impl Config {
 }
 
 fn text_of(file: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(file)
-        .map_err(|source| ConfigError::Read { file: file.to_owned(), source: advised(file, source) })
+    read_text(file).map_err(|source| ConfigError::Read { file: file.to_owned(), source: advised(file, source) })
 }
 
 /// Gives every vehicle what it has from `[vehicle_defaults]`.

@@ -55,8 +55,9 @@ pub struct Senders {
     may_call: MayCall,
 }
 
-/// Whether a client with these names in its certificate may do what this RPC does; if not, why.
-type MayCall = Box<dyn Fn(&str, &[String]) -> Result<(), String> + Send + Sync>;
+/// Whether a client with these names in its certificate may do what this RPC does, to this vehicle if one is named; if
+/// not, why.
+type MayCall = Box<dyn Fn(&str, Option<&str>, &[String]) -> Result<(), String> + Send + Sync>;
 
 impl Senders {
     /// The senders of a session whose peers connect to this server: each shows its own certificate.
@@ -64,16 +65,17 @@ impl Senders {
         Self { peers: PeerNames::new(session), may_call }
     }
 
-    /// Checks by the certificate of its link that the sender of a sample or query may do what an RPC does.
+    /// Checks by the certificate of its link that the sender of a sample or query may do what an RPC does, to a vehicle
+    /// if one is named.
     ///
     /// # Errors
     /// Why it may not.
-    pub async fn check(&mut self, rpc: &str, source: Option<ZenohId>) -> Result<(), String> {
+    pub async fn check(&mut self, rpc: &str, vehicle: Option<&str>, source: Option<ZenohId>) -> Result<(), String> {
         let Some(source) = source else {
             return Err("the message does not state its source; with roles it must (zenoh's source_info)".into());
         };
         let name = self.peers.name(source).await.map(str::to_owned);
-        (self.may_call)(rpc, name.as_slice())
+        (self.may_call)(rpc, vehicle, name.as_slice())
     }
 }
 
@@ -151,7 +153,10 @@ impl Ingest {
                     let bytes = Bytes::from(payload.to_bytes().into_owned());
                     self.bytes_queued.fetch_sub(bytes.len(), Ordering::Relaxed);
                     let allowed = match &mut self.senders {
-                        Some(senders) => senders.check("/clearway.v1.IngestService/Stream", source).await,
+                        Some(senders) => {
+                            let vehicle = Some(&*self.gateway.vehicle);
+                            senders.check("/clearway.v1.IngestService/Stream", vehicle, source).await
+                        }
                         None => Ok(()),
                     };
                     self.push(&key, bytes, allowed, &mut clients, &outcome_sender);

@@ -29,7 +29,7 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 
 use super::listen::access::Caller;
-use super::listen::{InProgress, Listener, Place, READ_BUFFER_BYTES};
+use super::listen::{Budget, InProgress, Listener, Place, READ_BUFFER_BYTES};
 use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
 use crate::encode::EncodedMap;
@@ -47,6 +47,9 @@ const PROTOCOL: &str = "foxglove.sdk.v1";
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 /// Longest message of a client, in bytes. Ours: a subscription to some hundred channels.
 const MESSAGE_BYTES_MAX: usize = 64 << 10;
+/// Most frames of a client at once, and how many more each second. Ours: a request for each of its subscriptions.
+const FRAMES_MAX: u32 = 1000;
+const FRAMES_PER_SECOND: u32 = 100;
 /// Most subscriptions of one client. Ours: some of each channel of some vehicles.
 const SUBSCRIPTIONS_MAX: usize = 256;
 
@@ -278,7 +281,8 @@ async fn connect(
     Extension(place): Extension<Arc<Place>>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    let upgrade = upgrade.protocols([PROTOCOL]).max_message_size(MESSAGE_BYTES_MAX).read_buffer_size(READ_BUFFER_BYTES);
+    let upgrade = upgrade.protocols([PROTOCOL]).max_message_size(MESSAGE_BYTES_MAX).max_frame_size(MESSAGE_BYTES_MAX);
+    let upgrade = upgrade.read_buffer_size(READ_BUFFER_BYTES);
     if upgrade.selected_protocol().is_none() {
         return (StatusCode::BAD_REQUEST, format!("the protocol {PROTOCOL} is needed\n")).into_response();
     }
@@ -286,7 +290,7 @@ async fn connect(
     upgrade.on_upgrade(move |socket| async move {
         let mut published = all.published.subscribe();
         published.mark_changed();
-        let client = Client { all, caller, subscriptions: BTreeMap::new(), _in_progress: in_progress };
+        let client = Client { all, caller, subscriptions: BTreeMap::new(), in_progress };
         client.run(socket, published).await;
     })
 }
@@ -296,7 +300,7 @@ struct Client {
     all: All,
     caller: Caller,
     subscriptions: BTreeMap<u32, Subscription>,
-    _in_progress: InProgress,
+    in_progress: InProgress,
 }
 
 /// One client's subscription to one channel.
@@ -339,6 +343,7 @@ impl Client {
                 return;
             }
         }
+        let mut budget = Budget::new(FRAMES_MAX, FRAMES_PER_SECOND);
         loop {
             let answer = tokio::select! {
                 changed = published.changed() => {
@@ -346,6 +351,7 @@ impl Client {
                     None
                 }
                 received = socket.recv() => match received {
+                    Some(Ok(_)) if !budget.take() => return self.in_progress.place().close_for_flood("messages"),
                     Some(Ok(WsMessage::Text(text))) => self.apply(&text).err(),
                     // The library answers pings, and other messages have no meaning here.
                     Some(Ok(_)) => continue,

@@ -150,6 +150,7 @@ async fn live(
         },
     };
     let in_progress = place.begin_request();
-    let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX).read_buffer_size(READ_BUFFER_BYTES);
+    let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX).max_frame_size(MESSAGE_BYTES_MAX);
+    let upgrade = upgrade.read_buffer_size(READ_BUFFER_BYTES);
     upgrade.on_upgrade(move |socket| live.serve(socket, in_progress))
 }

@@ -28,18 +28,18 @@ use std::time::{Duration, Instant};
 use axum::extract::ws::{Message as Frame, WebSocket};
 use bytes::Bytes;
 use clearway_proto::v1;
+use futures::Stream;
 use futures::channel::mpsc;
-use futures::stream::{AbortHandle, SelectAll, abortable};
-use futures::{Stream, StreamExt};
 use prost::Message;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::watch;
+use tokio_stream::{StreamExt, StreamMap};
 use tonic::{Code, Status};
 
 use super::grpc::reader::watch_from_page;
-use super::listen::InProgress;
 use super::listen::access::Caller;
+use super::listen::{Budget, InProgress};
 use super::page_points::{PagePoints, next_points};
 use super::page_recorder::{PageRecorder, RecorderRequest, recorder_answered};
 use super::page_replay::{PageReplay, PageRequest, replay_answered, replay_changed, replay_json};
@@ -61,6 +61,12 @@ pub(super) const MESSAGE_BYTES_MAX: usize = 4096;
 const WATCHES_MAX: usize = 64;
 /// Most acknowledgements that wait for one vehicle; more are a fault of the browser.
 const REQUESTS_MAX: usize = 64;
+/// Most frames of a browser at once, and how many more each second. Ours: an acknowledgement for each map of each vehicle
+/// at twice the rate at which a screen could show them.
+const FRAMES_MAX: u32 = 4000;
+const FRAMES_PER_SECOND: u32 = 2000;
+/// Shortest time between two statuses that are sent at once because another vehicle's is wanted. Ours.
+const DETAIL_PERIOD: Duration = Duration::from_millis(200);
 /// Parts of the status that only the view of one vehicle shows.
 const DETAILS: [&str; 4] = ["sensors", "ledger", "observations_refused", "recorder"];
 
@@ -89,21 +95,14 @@ struct WatchRequest {
     max_in_flight: u32,
 }
 
-/// The maps of one vehicle on their way to a browser. They end when this is dropped.
+/// What a browser asked for of one vehicle.
 struct Watching {
     id: u64,
     requests: mpsc::Sender<Result<v1::WatchRequest, Status>>,
-    updates: AbortHandle,
 }
 
-impl Drop for Watching {
-    fn drop(&mut self) {
-        self.updates.abort();
-    }
-}
-
-/// A map, or the end of a vehicle's maps, with the vehicle's name and the id of its selection.
-type Update = (String, u64, Result<v1::MapUpdate, Status>);
+/// The maps of one vehicle on their way to a browser.
+type Updates = Pin<Box<dyn Stream<Item = Result<v1::MapUpdate, Status>> + Send>>;
 
 /// Whether the browser reads: the pings it was sent, and its answers.
 #[derive(Default)]
@@ -214,8 +213,11 @@ pub(super) struct Live {
     recorder: Option<PageRecorder>,
     /// The vehicle whose whole status is sent.
     detail: String,
+    /// When a status was last sent at once, because another vehicle's is wanted.
+    detailed: Option<Instant>,
     watching: BTreeMap<String, Watching>,
-    updates: SelectAll<Pin<Box<dyn Stream<Item = Update> + Send>>>,
+    /// By vehicle: a new selection ends that before it at once, also while nothing is sent.
+    updates: StreamMap<String, Updates>,
 }
 
 impl Live {
@@ -223,10 +225,20 @@ impl Live {
     pub fn new(vehicles: &Vehicles, summaries: Summaries, caller: Caller, replay: Option<ReplayHandle>) -> Self {
         let vehicles = vehicles.0.iter().filter(|served| caller.may_reach(&served.status.name)).cloned().collect();
         let replay = replay.and_then(|handle| PageReplay::new(handle, &caller));
-        let (detail, watching, updates) = (String::new(), BTreeMap::new(), SelectAll::new());
-        let (fleet, points, recorder) = (Fleet::default(), None, None);
-        let is_of_one = false;
-        Self { vehicles, fleet, summaries, is_of_one, caller, replay, points, recorder, detail, watching, updates }
+        Self {
+            vehicles,
+            fleet: Fleet::default(),
+            summaries,
+            is_of_one: false,
+            caller,
+            replay,
+            points: None,
+            recorder: None,
+            detail: String::new(),
+            detailed: None,
+            watching: BTreeMap::new(),
+            updates: StreamMap::new(),
+        }
     }
 
     /// Adds the vehicles of other servers, and the recorder's buttons.
@@ -250,7 +262,8 @@ impl Live {
     }
 
     /// Sends maps and status until the browser disconnects or stalls, or the engines stop.
-    pub async fn serve(mut self, mut socket: WebSocket, _in_progress: InProgress) {
+    pub async fn serve(mut self, mut socket: WebSocket, in_progress: InProgress) {
+        let mut budget = Budget::new(FRAMES_MAX, FRAMES_PER_SECOND);
         let mut every = tokio::time::interval(STATUS_PERIOD);
         if let Some(recorder) = &self.recorder
             && socket.send(Frame::Text(recorder.state().into())).await.is_err()
@@ -270,6 +283,10 @@ impl Live {
                 answer = replay_answered(&mut self.replay) => text(answer),
                 answer = recorder_answered(&mut self.recorder) => text(answer),
                 received = socket.recv() => match received {
+                    Some(Ok(_)) if !budget.take() => {
+                        in_progress.place().close_for_flood("messages");
+                        Next::End
+                    }
                     Some(Ok(Frame::Text(text))) => self.apply(&text),
                     Some(Ok(Frame::Pong(pong))) if pings.answer(&pong) => self.status(),
                     // The library answers pings.
@@ -289,16 +306,15 @@ impl Live {
         }
     }
 
-    fn send(&mut self, (vehicle, id, update): Update) -> Next {
+    fn send(&mut self, (vehicle, update): (String, Result<v1::MapUpdate, Status>)) -> Next {
         match update {
             // The end of a replay is in its state.
             Ok(update) if update.replay_ended => Next::Nothing,
             Ok(update) => Next::Frame(Frame::Binary(Bytes::from(update.encode_to_vec()))),
             Err(status) if status.code() == Code::Unavailable => Next::End,
             Err(status) => {
-                if self.watching.get(&vehicle).is_some_and(|watching| watching.id == id) {
-                    self.watching.remove(&vehicle);
-                }
+                self.updates.remove(&vehicle);
+                let id = self.watching.remove(&vehicle).map_or(0, |watching| watching.id);
                 refused(&vehicle, id, status.message())
             }
         }
@@ -348,11 +364,16 @@ impl Live {
                 }
             }
             Ok(Request::Unwatch { vehicle }) => {
-                self.watching.remove(&vehicle);
+                self.unwatch(&vehicle);
                 Next::Nothing
             }
             Ok(Request::Detail { vehicle }) => {
                 self.detail = vehicle;
+                // More of them wait for the next answer to a ping.
+                if self.detailed.is_some_and(|at| at.elapsed() < DETAIL_PERIOD) {
+                    return Next::Nothing;
+                }
+                self.detailed = Some(Instant::now());
                 self.status()
             }
             Ok(Request::Points { vehicle, wanted: false }) => {
@@ -408,11 +429,15 @@ impl Live {
             ..Default::default()
         };
         let (requests, receiver) = mpsc::channel(REQUESTS_MAX);
-        let (updates, handle) = abortable(watch_from_page(served, selection, receiver)?);
-        let name = vehicle.clone();
-        self.updates.push(Box::pin(updates.map(move |update| (name.clone(), id, update))));
-        self.watching.insert(vehicle, Watching { id, requests, updates: handle });
+        let updates = watch_from_page(served, selection, receiver)?;
+        self.updates.insert(vehicle.clone(), Box::pin(updates));
+        self.watching.insert(vehicle, Watching { id, requests });
         Ok(())
+    }
+
+    fn unwatch(&mut self, vehicle: &str) {
+        self.watching.remove(vehicle);
+        self.updates.remove(vehicle);
     }
 
     /// Passes a request to a vehicle's maps. One for a selection that was replaced meanwhile means nothing any more.
@@ -423,7 +448,7 @@ impl Live {
         if watching.requests.try_send(Ok(request)).is_ok() {
             return Next::Nothing;
         }
-        self.watching.remove(vehicle);
+        self.unwatch(vehicle);
         refused(vehicle, id, &format!("more than {REQUESTS_MAX} requests wait"))
     }
 }

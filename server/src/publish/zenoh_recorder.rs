@@ -89,7 +89,7 @@ async fn answer(
     };
     if let Some(operators) = operators {
         let source = query.source_info().map(|source| source.source_id().zid());
-        operators.check(&format!("/clearway.v1.RecordingService/{rpc}"), source).await?;
+        operators.check(&format!("/clearway.v1.RecordingService/{rpc}"), None, source).await?;
     }
     let control = control.ok_or_else(|| ControlError::NoRecorder.to_string())?;
     if name == "list" {

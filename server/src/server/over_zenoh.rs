@@ -119,8 +119,10 @@ impl OverZenoh {
 fn senders(session: &Session, config: &Config) -> Option<Senders> {
     let has_roles = config.grpc.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
     let access = (has_roles && config.zenoh.mode != ZenohMode::Client).then(|| Access::new(&config.grpc.access))?;
-    let may_call = move |rpc: &str, names: &[String]| {
-        access.check(rpc, names).map(|_| ()).map_err(|status| status.message().to_owned())
+    let may_call = move |rpc: &str, vehicle: Option<&str>, names: &[String]| {
+        let caller = access.check(rpc, names);
+        let checked = caller.and_then(|caller| vehicle.map_or(Ok(()), |vehicle| caller.check_vehicle(vehicle)));
+        checked.map_err(|status| status.message().to_owned())
     };
     Some(Senders::new(session, Box::new(may_call)))
 }

@@ -38,10 +38,11 @@ pub const OBSERVATION_REASONS: [&str; 13] = [
     "stamp_ahead",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.
-pub const CLOSE_REASONS: [&str; 11] = [
+pub const CLOSE_REASONS: [&str; 12] = [
     "accept_error",
     "calls",
     "denied",
+    "flood",
     "handshake",
     "handshake_timeout",
     "idle",

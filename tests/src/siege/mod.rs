@@ -4,11 +4,13 @@
 //! |---|---|
 //! | [`h2`] | gRPC: frames of HTTP/2 as no honest client sends them |
 //! | [`sockets`] | every TCP listener: silence, single bytes, half headers, many connections |
+//! | [`browsers`] | the page: WebSocket frames and requests without pause, frames that are too long |
 //! | [`datagrams`] | UDP: floods of datagrams that are no packets, and of packets of another sender |
 //! | [`peers`] | zenoh: junk, forged maps, false answers |
 //! | [`target`] | what they have in common |
 //! | [`watch`] | the healthy readers beside the attacks, and the server's memory |
 
+pub mod browsers;
 pub mod datagrams;
 pub mod h2;
 pub mod peers;
@@ -20,5 +22,5 @@ use target::Attack;
 
 /// Every attack, in the order of the table.
 pub fn attacks() -> Vec<Attack> {
-    [sockets::ATTACKS, h2::ATTACKS, datagrams::ATTACKS, peers::ATTACKS].concat()
+    [sockets::ATTACKS, browsers::ATTACKS, h2::ATTACKS, datagrams::ATTACKS, peers::ATTACKS].concat()
 }

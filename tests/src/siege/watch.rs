@@ -107,6 +107,14 @@ pub async fn newcomer(target: &Target) -> Option<Duration> {
     tokio::time::timeout(PATIENCE, first).await.ok().flatten().map(|_| began.elapsed())
 }
 
+/// Processor time that a process has used, in s: fields 14 and 15 of `/proc/<process>/stat`, in hundredths.
+pub fn processor_s(process: u32) -> f64 {
+    let stat = std::fs::read_to_string(PathBuf::from(format!("/proc/{process}/stat"))).unwrap_or_default();
+    let after_name = stat.rsplit_once(')').map_or("", |(_, after)| after);
+    let ticks = after_name.split_whitespace().skip(11).take(2).filter_map(|ticks| ticks.parse::<f64>().ok());
+    ticks.sum::<f64>() / 100.0
+}
+
 /// Resident memory of a process, in MiB.
 pub fn resident_mib(process: u32) -> f64 {
     let status = std::fs::read_to_string(PathBuf::from(format!("/proc/{process}/status"))).unwrap_or_default();

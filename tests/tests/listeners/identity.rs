@@ -48,6 +48,9 @@ async fn every_path_asks_for_a_certificate_or_a_token_with_a_role() {
     let browser = format!("{}Accept: text/html\r\n", get(&format!("/?token={TOKEN}")));
     let (status, answer) = ask(page, &browser, None).await;
     assert!(status == 303 && answer.contains("location: /\r\n"), "{answer}");
+    // A browser would take the path of the second for another host.
+    let elsewhere = browser.replace("GET /?", "GET //evil.example/?");
+    assert!(ask(page, &elsewhere, None).await.1.contains("location: /evil.example/\r\n"));
     let cookie = answer.lines().find_map(|line| line.strip_prefix("set-cookie: ")).unwrap();
     assert!(["HttpOnly", "Secure", "SameSite=Strict"].iter().all(|word| cookie.contains(word)), "{cookie}");
     let cookie = cookie.split(';').next().unwrap();

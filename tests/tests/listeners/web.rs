@@ -19,6 +19,7 @@ async fn only_get_and_head_from_the_page_itself_are_answered() {
             ("evil.example:8080", 421),
             ("car.example.evil.example", 421),
             ("", 421),
+            ("[::1].evil.example", 421),
             ("127.0.0.1:8080", 200),
             ("192.168.1.7", 200),
             ("[::1]:8080", 200),
@@ -46,7 +47,9 @@ async fn only_get_and_head_from_the_page_itself_are_answered() {
     };
     let refused = [("/live?vehicle=car", running.page.unwrap()), ("/", running.foxglove.unwrap())];
     for (path, address) in refused {
-        for origin in ["http://evil.example", "null", "http://localhost.evil.example", "http://localhost:1"] {
+        for origin in
+            ["http://evil.example", "null", "http://localhost.evil.example", "http://localhost:1", "file://localhost"]
+        {
             assert_eq!(begin(address, &upgrade(path, origin)).await, "HTTP/1.1 403", "{origin}");
         }
         for origin in ["http://localhost", "https://fleet.example"] {

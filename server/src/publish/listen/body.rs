@@ -44,7 +44,7 @@ pub struct CountedBody {
     rest: Bytes,
     flow: Option<Arc<Flow>>,
     pause: Option<Pin<Box<Sleep>>>,
-    _in_progress: InProgress,
+    in_progress: InProgress,
     _grant: Option<Arc<Grant>>,
 }
 
@@ -53,13 +53,14 @@ impl CountedBody {
     pub fn new(body: Body, in_progress: InProgress, flow: Option<Arc<Flow>>, grant: Option<Arc<Grant>>) -> Self {
         // From now on the transport should ask for the first piece.
         flow.iter().for_each(|flow| flow.set_polled(false));
-        Self { body, rest: Bytes::new(), flow, pause: None, _in_progress: in_progress, _grant: grant }
+        Self { body, rest: Bytes::new(), flow, pause: None, in_progress, _grant: grant }
     }
 
     /// The next piece of the message.
     fn piece(&mut self, flow: Arc<Flow>) -> Frame<Bytes> {
         let bytes = self.rest.split_to(self.rest.len().min(PIECE_BYTES));
         flow.set_polled(false);
+        self.in_progress.place().add_piece();
         Frame::data(Bytes::from_owner(Piece { bytes, flow }))
     }
 }

@@ -23,6 +23,7 @@ const ALL_BYTES_MAX: usize = 32 << 20;
 pub struct Flows {
     responses_max: usize,
     responses_per_address_max: usize,
+    kept: usize,
     held: Mutex<Held>,
 }
 
@@ -41,16 +42,19 @@ struct Share {
 }
 
 impl Flows {
-    /// At most so many responses at once, in all and for one address.
-    pub fn new(responses_max: usize, responses_per_address_max: usize) -> Arc<Self> {
-        Arc::new(Self { responses_max, responses_per_address_max, held: Mutex::default() })
+    /// At most so many responses at once, in all and for one address. So many of all, but no more than half, are kept
+    /// for known peers.
+    pub fn new(responses_max: usize, responses_per_address_max: usize, kept: usize) -> Arc<Self> {
+        let kept = kept.min(responses_max / 2);
+        Arc::new(Self { responses_max, responses_per_address_max, kept, held: Mutex::default() })
     }
 
     /// Begins a response; `None` if there are too many.
-    pub fn begin(self: &Arc<Self>, peer: IpAddr, connection: u64) -> Option<Arc<Flow>> {
+    pub fn begin(self: &Arc<Self>, peer: IpAddr, connection: u64, is_known: bool) -> Option<Arc<Flow>> {
         let mut held = locked(&self.held);
         let of_address = held.addresses.get(&peer).map_or(0, |share| share.responses);
-        if held.responses >= self.responses_max || of_address >= self.responses_per_address_max {
+        let responses_max = self.responses_max - if is_known { 0 } else { self.kept };
+        if held.responses >= responses_max || of_address >= self.responses_per_address_max {
             return None;
         }
         held.responses += 1;
@@ -153,5 +157,22 @@ fn release<K: std::hash::Hash + Eq>(shares: &mut HashMap<K, Share>, key: &K) {
         if share.responses == 0 {
             shares.remove(key);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_responses_are_for_known_peers() {
+        let flows = Flows::new(4, 4, 9);
+        let address = |last: u8| IpAddr::from([127, 0, 0, last]);
+        let mut held: Vec<_> = (1..=2).map(|last| flows.begin(address(last), 1, false).expect("room")).collect();
+        assert!(flows.begin(address(3), 1, false).is_none());
+        held.extend((3..=4).map(|last| flows.begin(address(last), 1, true).expect("it is kept")));
+        assert!(flows.begin(address(5), 1, true).is_none());
+        drop(held);
+        assert!(flows.begin(address(5), 1, false).is_some());
     }
 }

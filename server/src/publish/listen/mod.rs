@@ -8,7 +8,8 @@
 //! | `places` | connections -> those that may stay: limits in all and of one address, idle and stalled ones closed |
 //! | `flow` | responses -> their bytes while they wait, limited |
 //! | `body` | the body of a response -> pieces for the transport, counted |
-//! | `connection` | a socket, plain or encrypted -> bytes, until its place is closed |
+//! | `connection` | a socket, plain or encrypted -> bytes, in turn with others, until its place is closed |
+//! | `frames` | the bytes of an HTTP/2 client -> its frames without data, limited by a `budget` |
 //! | `tls` | certificates -> TLS, names of clients |
 //! | [`access`] | names -> roles -> RPCs and paths, vehicles and layers |
 //! | [`security`] | certificates, roles and tokens that hold at present |
@@ -16,8 +17,10 @@
 
 pub mod access;
 mod body;
+mod budget;
 mod connection;
 mod flow;
+mod frames;
 mod places;
 pub mod security;
 mod tls;
@@ -46,6 +49,7 @@ use tower_service::Service;
 
 use access::Caller;
 use body::CountedBody;
+pub use budget::Budget;
 use connection::{Connection, Transport};
 use flow::Flows;
 use places::{Grant, Places};
@@ -159,7 +163,7 @@ impl Listener {
         security: Security,
         all: &AllPlaces,
     ) -> (Self, ListenerHandle) {
-        let flows = Flows::new(calls.0, calls.1);
+        let flows = Flows::new(calls.0, calls.1, limits.kept);
         let places = Places::new(limits, flows.clone());
         let shared = Shared { protocol, places: places.clone(), security };
         all.add(places.clone());
@@ -216,7 +220,8 @@ impl Shared {
         // A failure leaves the default, which is slower but right.
         let _ = stream.set_nodelay(true);
         let Some((transport, names)) = self.secure(stream, &place).await else { return };
-        let io = TokioIo::new(Connection::new(transport, place.clone()));
+        let is_http2 = self.protocol == Protocol::Grpc;
+        let io = TokioIo::new(Connection::new(transport, place.clone(), is_http2));
         let (protocol, names) = (self.protocol, Arc::new(names));
         let service =
             service_fn(move |request| self.clone().answer(request, place.clone(), names.clone(), router.clone()));
@@ -346,8 +351,8 @@ impl Shared {
     fn refuse_call(&self, place: &Place) -> Response<Body> {
         place.count("calls");
         let text = format!(
-            "too many calls are in progress: connections.calls_max and connections.calls_per_address_max limit those \
-             of all clients and those of {}",
+            "too many calls are in progress: connections.calls_max, of which connections.kept are for known peers, and \
+             connections.calls_per_address_max limit those of all clients and those of {}",
             place.peer()
         );
         self.refuse(StatusCode::SERVICE_UNAVAILABLE, Status::resource_exhausted(text))

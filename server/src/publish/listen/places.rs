@@ -6,8 +6,8 @@
 //! silent and half-open connections can never keep another peer out, however many hosts open them.
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::net::{IpAddr, Ipv6Addr};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
@@ -58,6 +58,15 @@ impl Limits {
             idle: Duration::from_secs(config.idle_s),
             stalled: Duration::from_secs(config.stalled_s),
         }
+    }
+}
+
+/// What counts as one address: an IPv4 address, or a network of IPv6 with a prefix of 64 bits, because a host may take
+/// any address of its network.
+fn host_of(peer: IpAddr) -> IpAddr {
+    match peer {
+        IpAddr::V4(_) => peer,
+        IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into(),
     }
 }
 
@@ -121,6 +130,8 @@ struct Open {
 #[derive(Debug)]
 struct Occupant {
     peer: IpAddr,
+    /// What counts as one address.
+    host: IpAddr,
     is_known: AtomicBool,
     over_limit: Mutex<Option<String>>,
     opened: Instant,
@@ -128,6 +139,8 @@ struct Occupant {
     activity: Mutex<Activity>,
     flows: Mutex<Vec<Arc<Flow>>>,
     grants: Mutex<Vec<Weak<Grant>>>,
+    /// Pieces of responses that the transport was given since the last [`Place::take_pieces`].
+    pieces: AtomicU32,
     /// That of the newest request: a WebSocket outlives its response.
     newest_grant: Mutex<Option<Arc<Grant>>>,
 }
@@ -259,6 +272,7 @@ impl Places {
         let now = Instant::now();
         let occupant = Arc::new(Occupant {
             peer,
+            host: host_of(peer),
             is_known: is_known.into(),
             over_limit: Mutex::new(over_limit),
             opened: now,
@@ -266,6 +280,7 @@ impl Places {
             activity: Mutex::new(Activity { requests: 0, in_progress: 0, idle_since: now, blocked_since: None }),
             flows: Mutex::default(),
             grants: Mutex::default(),
+            pieces: AtomicU32::new(0),
             newest_grant: Mutex::default(),
         });
         open.next += 1;
@@ -279,7 +294,8 @@ impl Places {
     /// # Errors
     /// What is exhausted, as a text.
     fn make_room(&self, open: &Open, limits: &Limits, peer: IpAddr, is_known: bool) -> Result<(), String> {
-        let of_peer = |occupant: &Occupant| occupant.peer == peer;
+        let host = host_of(peer);
+        let of_peer = |occupant: &Occupant| occupant.host == host;
         let count = |of: &dyn Fn(&Occupant) -> bool| open.all.values().filter(|o| o.counts() && of(o)).count();
         let of_address = count(&of_peer);
         if of_address >= limits.per_address_max && !self.close_idlest(open, "made_room", of_peer) {
@@ -367,6 +383,23 @@ impl Place {
         self.places.count(reason);
     }
 
+    /// Closes the connection, because its client sends too many of these.
+    pub fn close_for_flood(&self, of: &str) {
+        tracing::info!(peer = %self.peer(), reason = "flood", of, "connection closed");
+        self.count("flood");
+        self.occupant.closing.cancel();
+    }
+
+    /// Records that the transport was given a piece of a response.
+    pub fn add_piece(&self) {
+        self.occupant.pieces.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Number of pieces since the last call.
+    pub fn take_pieces(&self) -> u32 {
+        self.occupant.pieces.swap(0, Ordering::Relaxed)
+    }
+
     /// Records whether the socket takes no byte at present.
     pub fn set_blocked(&self, is_blocked: bool) {
         let blocked_since = &mut locked(&self.occupant.activity).blocked_since;
@@ -395,7 +428,7 @@ impl Place {
     pub fn begin_flow(&self) -> Option<Arc<Flow>> {
         let mut flows = locked(&self.occupant.flows);
         flows.retain(|flow| Arc::strong_count(flow) > 1);
-        let flow = self.places.flows.begin(self.occupant.peer, self.number)?;
+        let flow = self.places.flows.begin(self.occupant.host, self.number, self.occupant.is_known())?;
         flows.push(flow.clone());
         Some(flow)
     }
@@ -411,10 +444,38 @@ impl Drop for Place {
 #[derive(Debug)]
 pub struct InProgress(Arc<Place>);
 
+impl InProgress {
+    /// The connection of the request.
+    pub fn place(&self) -> &Place {
+        &self.0
+    }
+}
+
 impl Drop for InProgress {
     fn drop(&mut self) {
         let mut activity = locked(&self.0.occupant.activity);
         activity.in_progress -= 1;
         activity.idle_since = Instant::now();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Connections;
+
+    #[test]
+    fn a_host_with_a_network_of_ipv6_counts_as_one_address() {
+        let config = Connections { per_address_max: 2, ..Connections::default() };
+        let places = Places::new(Limits::new(&config, 100, "the test"), Flows::new(100, 2, 0));
+        let of = |address: &str| Arc::new(places.admit(address.parse().unwrap()));
+        let held: Vec<_> = ["2001:db8::1", "2001:db8::2"].map(of).map(|place| (place.begin_request(), place)).into();
+        let flows: Vec<_> = held.iter().map(|(_, place)| place.begin_flow().expect("a call")).collect();
+        let third = of("2001:db8::ffff:3");
+        assert!(third.over_limit().is_some() && third.begin_flow().is_none());
+        for other in ["2001:db8:0:1::1", "10.0.0.1"].map(of) {
+            assert!(other.over_limit().is_none() && other.begin_flow().is_some());
+        }
+        drop((flows, held));
     }
 }

@@ -42,7 +42,10 @@ pub fn check(
         return Err(refuse(StatusCode::MISDIRECTED_REQUEST, text));
     }
     if let Some(origin) = text_of(headers, header::ORIGIN) {
-        let is_own = origin.split_once("://").is_some_and(|(_, authority)| authority == host);
+        // Without certificates of its own, the server may stand behind a proxy that has some.
+        let is_scheme = |scheme: &str| scheme == "https" || (scheme == "http" && current.tls.is_none());
+        let own = origin.split_once("://").filter(|(scheme, authority)| is_scheme(scheme) && *authority == host);
+        let is_own = own.is_some();
         if !is_own && !origins.contains(&origin) && !current.origins.iter().any(|listed| listed == origin) {
             let text = format!("origin {origin:?}: the page itself, or an origin in connections.origins, is allowed");
             return Err(refuse(StatusCode::FORBIDDEN, text));
@@ -76,10 +79,12 @@ fn refuse_role(status: &Status, is_nameless: bool) -> Box<Response<Body>> {
     Box::new(response)
 }
 
-/// A cookie that scripts cannot read and that other pages cannot send, and the address without the token.
+/// A cookie that scripts cannot read and that other pages cannot send, and the address without the token. Browsers take
+/// a path that begins with two slashes for another host.
 fn redirect_with_cookie(path: &str, token: &str) -> Response<Body> {
     let cookie = format!("{COOKIE}={token}; Path=/; HttpOnly; Secure; SameSite=Strict");
-    let headers = [(header::SET_COOKIE, cookie), (header::LOCATION, path.to_owned())];
+    let path = format!("/{}", path.trim_start_matches(['/', '\\']));
+    let headers = [(header::SET_COOKIE, cookie), (header::LOCATION, path)];
     (StatusCode::SEE_OTHER, headers).into_response()
 }
 
@@ -101,8 +106,8 @@ fn text_of(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
 /// The host of `host:port`, without the brackets of an IPv6 address.
 fn host_of(authority: &str) -> &str {
     match authority.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
-        Some((address, _)) => address,
-        None => authority.rsplit_once(':').map_or(authority, |(host, _)| host),
+        Some((address, port)) if port.is_empty() || port.starts_with(':') => address,
+        _ => authority.rsplit_once(':').map_or(authority, |(host, _)| host),
     }
 }
 
