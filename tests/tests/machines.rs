@@ -6,7 +6,7 @@ mod fixture;
 
 use std::sync::{Mutex, PoisonError};
 
-/// The names of the machines are those of the host, so one test at a time has them.
+/// One test at a time has the processor: a machine with much to do delays maps.
 static MACHINES: Mutex<()> = Mutex::new(());
 
 /// What `machines` prints.

@@ -467,7 +467,7 @@ fn one_file_has_vehicles_with_the_same_addresses_of_which_each_server_uses_its_o
     let config = Config::load_vehicles(&file, &["vehicle.maps.valid_ms=200".into()], &car2).unwrap();
     assert_eq!((names(&config), config.vehicles[0].maps.valid_ms), (car2.to_vec(), 200));
     let explained = Config::explain(&file, &none, &car2).unwrap();
-    assert!(explained.contains("name = \"car2\"  # fleet.toml:14\n") && !explained.contains("car1"), "{explained}");
+    assert!(explained.contains("name = \"car2\"  # fleet.toml:17\n") && !explained.contains("car1"), "{explained}");
     let unknown = Config::load_vehicles(&file, &none, &["car3".into()]).unwrap_err().to_string();
     assert!(unknown.ends_with("there is no vehicle car3; its vehicles: car1, car2"), "{unknown}");
 }
