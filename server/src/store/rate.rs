@@ -1,8 +1,8 @@
 //! How fast recordings are uploaded, so that the maps on the same link stay fresh.
 //!
 //! In: what share of their validity the link takes for the newest maps. Out: when the next bytes of an upload may be
-//! sent. While nobody reads maps over the link, or without a link that is measured, uploads are limited by
-//! `store.upload_kbit_s_max` alone.
+//! sent. Without a link that is measured, uploads are limited by `store.upload_kbit_s_max` alone; while nobody reads maps
+//! over it, they get faster until they have all of it.
 //!
 //! An upload that is faster than what the maps leave of the link fills its queue, and the maps wait there. So the rate
 //! is halved when a map takes more than half its validity, and grows while maps are in time, as TCP does by losses.
@@ -20,13 +20,17 @@ const SHARE_MAX: f64 = 0.5;
 const RATE_MIN: f64 = 2e3;
 /// Rate, in bytes a second, when a reader's first map is on the link. Ours: a quarter of a thin link of 500 kbit/s.
 const RATE_BEGIN: f64 = 16e3;
-/// Growth of a rate that is used, in a second, and after maps were in time for [`CALM`]. Ours: with the first, the link
-/// is full for less than a second before maps are late; with the second, 10 Mbit/s are reached in 7 s.
-const GROWTH: [f64; 2] = [1.2, 2.5];
+/// Growth of a rate that is used, in a second, and while no map was late for [`CALM`] or none is on the link. Ours: with the first, the link is
+/// full for less than a second before maps are late; with the second, 10 Mbit/s are reached in 3 s.
+const GROWTH: [f64; 2] = [1.2, 4.0];
 /// Time without late maps after which the rate grows faster. Ours: longer than from a halving to the next.
 const CALM: Duration = Duration::from_secs(5);
 /// Time for which the rate is not halved again. Ours: until then the queue is that of the rate before.
 const HALVED: Duration = Duration::from_millis(400);
+/// Time over which what is sent is measured. Ours: as long as a halving shows.
+const MEASURED: Duration = Duration::from_millis(400);
+/// A rate grows if so many times what is sent is more: one that is not used is not known to fit.
+const USED: f64 = 1.3;
 /// Longest time between two looks that counts as growth.
 const LOOK_MAX: Duration = Duration::from_millis(200);
 /// Time for which bytes may be sent that were not sent before.
@@ -39,48 +43,57 @@ const ANSWER_BYTES: [f64; 2] = [8e3, (8 << 20) as f64];
 /// Time in which an answer of the store is to arrive.
 const ANSWER: Duration = Duration::from_millis(150);
 
-/// What share of their validity the link takes for the newest maps; `None` while no map is on it.
+/// What share of their validity the link takes for the newest maps; `None` while no map is on it, or if it is not
+/// measured.
 pub type LinkShare = dyn Fn() -> Option<f64> + Send + Sync;
 
 /// The rate at one time, and what was sent of it.
 #[derive(Debug)]
 struct Rate {
-    /// Bytes a second; infinite without maps on the link.
+    /// Bytes a second; infinite until a map was on the link.
     bytes_s: f64,
     /// Limit of the configuration.
     bytes_s_max: f64,
     /// Bytes that may be sent now; below 0 after a piece that was sent ahead.
     bytes: f64,
+    /// What was sent in a second, of late.
+    sent_s: f64,
     seen: Instant,
     halved: Option<Instant>,
 }
 
 impl Rate {
     fn new(bytes_s_max: f64, now: Instant) -> Self {
-        Self { bytes_s: f64::INFINITY, bytes_s_max, bytes: 0.0, seen: now, halved: None }
+        Self { bytes_s: f64::INFINITY, bytes_s_max, bytes: 0.0, sent_s: 0.0, seen: now, halved: None }
     }
 
     fn limit(&self) -> f64 {
         self.bytes_s.min(self.bytes_s_max)
     }
 
-    /// Brings the rate up to date. It grows only if an upload waits for it: one that is not used is not known to fit.
-    fn see(&mut self, now: Instant, link_share: Option<f64>, is_used: bool) {
+    /// Brings the rate up to date.
+    fn see(&mut self, now: Instant, link_share: Option<f64>) {
         let passed = now.saturating_duration_since(self.seen);
         self.seen = now;
+        self.sent_s *= (-passed.div_duration_f64(MEASURED)).exp();
+        let is_used = self.bytes_s < USED * self.sent_s.max(RATE_MIN) && self.bytes_s < self.bytes_s_max;
         match link_share {
-            None => (self.bytes_s, self.halved) = (f64::INFINITY, None),
-            Some(_) if self.bytes_s.is_infinite() => (self.bytes_s, self.halved) = (RATE_BEGIN, Some(now)),
+            Some(_) if self.bytes_s.is_infinite() => self.bytes_s = RATE_BEGIN,
+            None if self.bytes_s.is_infinite() => {}
             Some(share) if share > SHARE_MAX => {
                 if self.halved.is_none_or(|at| now.saturating_duration_since(at) >= HALVED) {
-                    (self.bytes_s, self.halved) = ((self.bytes_s / 2.0).max(RATE_MIN), Some(now));
+                    let sent = self.bytes_s.min(self.sent_s.max(RATE_BEGIN));
+                    (self.bytes_s, self.halved) = ((sent / 2.0).max(RATE_MIN), Some(now));
                 }
             }
-            Some(_) if is_used && self.bytes_s < self.bytes_s_max => {
-                let is_calm = self.halved.is_none_or(|at| now.saturating_duration_since(at) >= CALM);
+            // Without maps it grows too, and not to any rate at once: a link that is cut carries no map either, and what
+            // were written to it then would wait in front of the next ones.
+            Some(_) | None if is_used => {
+                let is_calm =
+                    link_share.is_none() || self.halved.is_none_or(|at| now.saturating_duration_since(at) >= CALM);
                 self.bytes_s *= GROWTH[usize::from(is_calm)].powf(passed.min(LOOK_MAX).as_secs_f64());
             }
-            Some(_) => {}
+            Some(_) | None => {}
         }
         let limit = self.limit();
         if limit.is_finite() {
@@ -91,15 +104,12 @@ impl Rate {
     /// Time until a piece may be sent; zero: it is counted as sent.
     fn take(&mut self, bytes: usize) -> Duration {
         let limit = self.limit();
-        if limit.is_infinite() {
-            self.bytes = 0.0;
-            return Duration::ZERO;
+        if limit.is_finite() && self.bytes < 0.0 {
+            return Duration::from_secs_f64(-self.bytes / limit).clamp(Duration::from_millis(1), WAIT_MAX);
         }
-        if self.bytes >= 0.0 {
-            self.bytes -= bytes as f64;
-            return Duration::ZERO;
-        }
-        Duration::from_secs_f64(-self.bytes / limit).clamp(Duration::from_millis(1), WAIT_MAX)
+        self.sent_s += bytes as f64 / MEASURED.as_secs_f64();
+        self.bytes = if limit.is_finite() { self.bytes - bytes as f64 } else { 0.0 };
+        Duration::ZERO
     }
 
     fn piece(&self, of: Duration, [least, most]: [f64; 2]) -> usize {
@@ -134,18 +144,16 @@ impl UploadRate {
 
     /// Waits until these bytes may be sent or requested.
     pub async fn take(&self, bytes: usize) {
-        let mut is_used = false;
         loop {
             let share = (self.link_share)();
             let wait = {
                 let mut rate = locked(&self.rate);
-                rate.see(Instant::now(), share, is_used);
+                rate.see(Instant::now(), share);
                 rate.take(bytes)
             };
             if wait.is_zero() {
                 return;
             }
-            is_used = true;
             tokio::time::sleep(wait).await;
         }
     }
@@ -184,7 +192,7 @@ mod tests {
         // The queue: number of a map and when it was sent, or none for the upload, and the bytes that are left.
         let mut queue = std::collections::VecDeque::<(Option<(u64, u64)>, f64)>::new();
         let mut carried = Carried { upload: vec![0.0; seconds as usize], maps_ms: Vec::new() };
-        let mut newest: Option<(u64, f64)> = None;
+        let mut newest = None::<(u64, f64)>;
         for ms in 0..seconds * 1000 {
             let (now, second) = (start + Duration::from_millis(ms), ms / 1000);
             let mut left = bytes_s(second) / 1e3;
@@ -211,7 +219,7 @@ mod tests {
                 newest = Some((ms, (ms - at) as f64 / VALID_MS));
             }
             let share = newest.filter(|(at, _)| ms - at < 1000).map(|(_, share)| share);
-            rate.see(now, share, true);
+            rate.see(now, share);
             // The kernel holds what the link's queue of 64 KiB does not take.
             let waits: f64 = queue.iter().map(|(_, bytes)| bytes).sum();
             let bytes = rate.piece(BURST, PIECE_BYTES);
@@ -243,7 +251,7 @@ mod tests {
     #[test]
     fn an_upload_has_the_whole_link_while_nobody_reads_maps_and_gives_way_to_a_reader_that_comes() {
         let carried = drive(60, |_| 125e3, |second| !(10..20).contains(&second));
-        assert!(carried.upload[12..20].iter().all(|bytes| *bytes > 0.99 * 125e3), "{:?}", carried.upload);
+        assert!(carried.upload[13..20].iter().all(|bytes| *bytes > 0.99 * 125e3), "{:?}", carried.upload);
         let late = carried.maps_ms.iter().filter(|(number, ms)| *number >= 210 && *ms > 250.0).count();
         assert!(late < 10, "{late} maps are late after the first second of the reader");
     }
@@ -261,7 +269,7 @@ mod tests {
             let mut rate = Rate::new(50e3, start);
             let mut sent = 0;
             for ms in 0..10_000 {
-                rate.see(start + Duration::from_millis(ms), share, true);
+                rate.see(start + Duration::from_millis(ms), share);
                 if rate.take(2000).is_zero() {
                     sent += 2000;
                 }
