@@ -15,14 +15,16 @@ use crate::base::sync::locked;
 /// Share of a map's validity that the link may take for it before uploads give way. Ours: the other half is left for
 /// making the map, and for what is on the way when the rate falls.
 const SHARE_MAX: f64 = 0.5;
+/// Share below which uploads may get faster soon. Ours: a map that waits for nothing on a link of 1 Mbit/s takes less.
+const SHARE_CALM: f64 = 0.25;
 /// Lowest rate, in bytes a second, of an upload that gives way. Ours: stores close a request of which nothing arrives
 /// for 20 s.
 const RATE_MIN: f64 = 2e3;
 /// Rate, in bytes a second, when a reader's first map is on the link. Ours: a quarter of a thin link of 500 kbit/s.
 const RATE_BEGIN: f64 = 16e3;
 /// Growth of a rate that is used, in a second, and while no map was late for [`CALM`] or none is on the link. Ours: with the first, the link is
-/// full for less than a second before maps are late; with the second, 10 Mbit/s are reached in 3 s.
-const GROWTH: [f64; 2] = [1.2, 4.0];
+/// full for less than a second before maps are late; with the second, 10 Mbit/s are reached in 2 s.
+const GROWTH: [f64; 2] = [1.2, 8.0];
 /// Time without late maps after which the rate grows faster. Ours: longer than from a halving to the next.
 const CALM: Duration = Duration::from_secs(5);
 /// Time for which the rate is not halved again. Ours: until then the queue is that of the rate before.
@@ -30,7 +32,7 @@ const HALVED: Duration = Duration::from_millis(400);
 /// Time over which what is sent is measured. Ours: as long as a halving shows.
 const MEASURED: Duration = Duration::from_millis(400);
 /// A rate grows if so many times what is sent is more: one that is not used is not known to fit.
-const USED: f64 = 1.3;
+const USED: f64 = 2.0;
 /// Longest time between two looks that counts as growth.
 const LOOK_MAX: Duration = Duration::from_millis(200);
 /// Time for which bytes may be sent that were not sent before.
@@ -89,8 +91,8 @@ impl Rate {
             // Without maps it grows too, and not to any rate at once: a link that is cut carries no map either, and what
             // were written to it then would wait in front of the next ones.
             Some(_) | None if is_used => {
-                let is_calm =
-                    link_share.is_none() || self.halved.is_none_or(|at| now.saturating_duration_since(at) >= CALM);
+                let was_late = self.halved.is_some_and(|at| now.saturating_duration_since(at) < CALM);
+                let is_calm = link_share.is_none_or(|share| share < SHARE_CALM && !was_late);
                 self.bytes_s *= GROWTH[usize::from(is_calm)].powf(passed.min(LOOK_MAX).as_secs_f64());
             }
             Some(_) | None => {}
