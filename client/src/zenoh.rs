@@ -12,6 +12,8 @@ use std::hash::{BuildHasher, Hasher};
 use std::path::Path;
 use std::sync::Arc;
 
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use clearway_proto::v1;
 use prost::Message;
 use zenoh::qos::CongestionControl;
@@ -20,6 +22,7 @@ use zenoh::{Config, Session};
 
 use crate::error::ClientError;
 use crate::freshness::Clock;
+use crate::grpc::Tls;
 use crate::ingest::{Ingester, ReportReceiver, SendObservation};
 use crate::signature::PublicKey;
 use crate::stream::{LatestSlot, MapStream};
@@ -27,9 +30,11 @@ use crate::view::MapView;
 
 mod query;
 mod replay;
+mod standby;
 mod subscription;
 
 use query::{LayerKey, QUERY_TIMEOUT, failed};
+use standby::Standby;
 use subscription::LayerSubscription;
 
 /// Settings of every session. They override those of a configuration file.
@@ -53,17 +58,26 @@ const SETTINGS: [(&str, &str); 11] = [
 ];
 
 /// A zenoh session that reads maps and sends observations.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct ZenohClient {
     session: Session,
     endpoint: String,
     signed_by: Option<PublicKey>,
+    /// For streams whose maps stop although the session has a router; `None` if it knows one router alone.
+    standby: Option<Arc<Standby>>,
+}
+
+impl std::fmt::Debug for ZenohClient {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_struct("ZenohClient").field("endpoint", &self.endpoint).finish_non_exhaustive()
+    }
 }
 
 impl ZenohClient {
     /// Connects to an endpoint, such as `tcp/localhost:7447`, without scouting or listening. Of several, separated by
     /// commas, it uses the first that answers, and when that one is lost again the first that answers: a planner that
-    /// knows two routers outlives one.
+    /// knows two routers outlives one. A stream whose maps stop although its router answers reads through another one,
+    /// with a session more, until they come again.
     ///
     /// # Errors
     /// [`ClientError::Zenoh`] if the text is not an endpoint or no router answers.
@@ -82,14 +96,38 @@ impl ZenohClient {
         Self::open(endpoint, config).await
     }
 
+    /// As [`ZenohClient::connect`], with these certificates, for `tls/HOST:PORT`. The name in the certificate of the
+    /// router must be that of the endpoint.
+    ///
+    /// # Errors
+    /// As [`ZenohClient::connect`].
+    pub async fn connect_tls(endpoint: &str, tls: &Tls) -> Result<Self, ClientError> {
+        let mut config = Config::default();
+        let (certificate, key) = tls.identity.clone().unwrap_or_default();
+        let values = [
+            ("root_ca_certificate_base64", &tls.ca),
+            ("connect_certificate_base64", &certificate),
+            ("connect_private_key_base64", &key),
+        ];
+        for (name, pem) in values.into_iter().filter(|(_, pem)| !pem.is_empty()) {
+            let (setting, value) = (format!("transport/link/tls/{name}"), BASE64_STANDARD.encode(pem));
+            config.insert_json5(&setting, &format!("{value:?}")).map_err(failed(setting))?;
+        }
+        let mtls = "transport/link/tls/enable_mtls";
+        config.insert_json5(mtls, &tls.identity.is_some().to_string()).map_err(failed(mtls))?;
+        Self::open(endpoint, config).await
+    }
+
     async fn open(endpoint: &str, mut config: Config) -> Result<Self, ClientError> {
         for (key, value) in SETTINGS {
             config.insert_json5(key, value).map_err(failed(format!("{key} = {value}")))?;
         }
         let endpoints = format!("{:?}", endpoint.split(',').collect::<Vec<_>>());
         config.insert_json5("connect/endpoints", &endpoints).map_err(failed(format!("endpoint {endpoint:?}")))?;
-        let session = zenoh::open(config).await.map_err(failed(format!("connect to {endpoint}")))?;
-        Ok(Self { session, endpoint: endpoint.into(), signed_by: None })
+        let opened = zenoh::open(config.clone()).await;
+        let session = opened.map_err(failed(format!("connect to {endpoint}")))?;
+        let standby = Standby::new(&session, &config, endpoint).map(Arc::new);
+        Ok(Self { session, endpoint: endpoint.into(), signed_by: None, standby })
     }
 
     /// Believes only maps that have a signature of this key; the others are counted and passed over
@@ -136,14 +174,24 @@ impl ZenohClient {
     pub async fn subscribe(&self, vehicle: &str, layer: &str) -> Result<MapStream, ClientError> {
         let layer = LayerKey::new(vehicle, layer, self.signed_by.clone());
         let (slot, key) = (LatestSlot::new(Clock::default()), layer.key.clone());
-        let subscription = LayerSubscription::open(&self.session, layer, slot.clone()).await;
+        let subscription = LayerSubscription::open(&self.session, layer.clone(), slot.clone()).await;
         let subscription = subscription.map_err(failed(format!("subscribe to {key}")))?;
         let replay = replay::subscribe(&self.session, vehicle, slot.clone(), &self.endpoint).await?;
         // A session closes with its last clone and ends its subscriptions, so the stream keeps a clone.
-        let Self { session, endpoint: address, .. } = self.clone();
+        let Self { session, endpoint: address, standby, .. } = self.clone();
+        let filled = slot.clone();
         Ok(MapStream::of_slot(&slot, async move {
             let (_session, _replay) = (session, replay);
-            subscription.closed().await;
+            let cover = async {
+                match &standby {
+                    Some(standby) => standby.cover(&layer, &filled, subscription.arrivals()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                () = subscription.closed() => {}
+                () = cover => {}
+            }
             ClientError::Ended { address }
         }))
     }

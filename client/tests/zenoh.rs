@@ -361,3 +361,33 @@ async fn with_a_public_key_only_maps_signed_with_its_private_key_are_believed() 
     published.put(next.clone()).attachment(server_key.sign(KEY, &next)).await.unwrap();
     assert_eq!(next_fresh(&mut maps).await, (3, 0, 0));
 }
+
+/// A router that is joined to no other, and its address.
+async fn lone_router() -> (Session, String) {
+    let mut config = zenoh::Config::default();
+    config.insert_json5("mode", "\"router\"").unwrap();
+    config.insert_json5("listen/endpoints", "[\"tcp/127.0.0.1:0\"]").unwrap();
+    config.insert_json5("scouting/multicast/enabled", "false").unwrap();
+    let router = zenoh::open(config).await.unwrap();
+    let endpoint = router.info().locators().await.first().unwrap().to_string();
+    (router, endpoint)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_planner_that_knows_two_routers_reads_through_the_second_while_the_first_has_no_maps() {
+    let ((first, near), (second, far)) = (lone_router().await, lone_router().await);
+    let publisher = publisher(&second).await;
+    publisher.put(map(1, CAPTURE_END_NS)).await.unwrap();
+    // The session is at the router that answers first, so the other order has the other router.
+    for endpoints in [format!("{near},{far}"), format!("{far},{near}")] {
+        let client = ZenohClient::connect(&endpoints).await.unwrap();
+        let mut maps = client.subscribe("alpha", "drivability").await.unwrap();
+        assert_eq!(next(&mut maps).await.0, 1, "{endpoints}");
+    }
+    // A planner that knows one router waits there.
+    let client = ZenohClient::connect(&near).await.unwrap();
+    let mut maps = client.subscribe("alpha", "drivability").await.unwrap();
+    let of_first = self::publisher(&first).await;
+    of_first.put(map(2, CAPTURE_END_NS + 1)).await.unwrap();
+    assert_eq!(next(&mut maps).await.0, 2);
+}

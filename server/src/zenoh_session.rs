@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use zenoh::session::ZenohId;
 use zenoh::{Config, Session};
 
-use crate::config::Zenoh as Options;
+use crate::config::{Zenoh as Options, ZenohMode};
 
 /// What one peer may cost: zenoh's setting, value in JSON5. A file named in `[zenoh]` has its own values; the files in
 /// `deploy/zenoh` have these. All values are ours, for the reasons beside them.
@@ -58,17 +58,17 @@ impl ZenohError {
     }
 }
 
-/// Opens the session. Without access control in the file of `[zenoh]`, no peer may publish what the server publishes of
+/// The settings of the session. Without access control in the file of `[zenoh]`, no peer may publish what the server publishes of
 /// its `vehicles` ([`own_keys`]). A message of a peer may be twice as long as `observation_bytes_max`, and
 /// [`MESSAGE_BYTES_MAX`] in any case.
 ///
 /// # Errors
-/// [`ZenohError`] if the settings are invalid, the file of `[zenoh]` cannot be read, or an endpoint is not available.
-pub(crate) async fn open(
+/// [`ZenohError`] if the settings are invalid or the file of `[zenoh]` cannot be read.
+pub(crate) fn settings<'a>(
     options: &Options,
     observation_bytes_max: usize,
-    vehicles: impl Iterator<Item = &str>,
-) -> Result<Session, ZenohError> {
+    vehicles: impl Iterator<Item = &'a str>,
+) -> Result<Config, ZenohError> {
     let mut config = session_config(options, MESSAGE_BYTES_MAX.max(2 * observation_bytes_max))?;
     if config.get_json("access_control/enabled").is_ok_and(|enabled| enabled != "true") {
         let own_keys = own_keys(vehicles);
@@ -76,8 +76,19 @@ pub(crate) async fn open(
             config.insert_json5(key, &value.to_string()).map_err(ZenohError::of(key))?;
         }
     }
-    let endpoints = options.listen.join(", ");
-    zenoh::open(config).await.map_err(ZenohError::of(format!("open (listen {endpoints})")))
+    Ok(config)
+}
+
+/// Opens the session.
+///
+/// # Errors
+/// [`ZenohError`] if an endpoint is not available, or if it is the client of a router and none answers.
+pub(crate) async fn open(config: Config, options: &Options) -> Result<Session, ZenohError> {
+    let endpoints = match options.mode {
+        ZenohMode::Client => format!("connect {}", options.connect.join(", ")),
+        ZenohMode::Peer | ZenohMode::Router => format!("listen {}", options.listen.join(", ")),
+    };
+    zenoh::open(config).await.map_err(ZenohError::of(format!("open ({endpoints})")))
 }
 
 /// The endpoints the session listens on, with the ports that the system chose.

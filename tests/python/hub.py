@@ -30,10 +30,11 @@ def ip(*arguments: str) -> None:
 
 def machine(name: str, host: int) -> int:
     """The open end of the interface of a new namespace."""
+    interface = f"hub{host}-{os.getpid()}"
     tun = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
-    fcntl.ioctl(tun, TUNSETIFF, struct.pack("16sH22x", f"hub{host}".encode(), IFF_TUN | IFF_NO_PI))
+    fcntl.ioctl(tun, TUNSETIFF, struct.pack("16sH22x", interface.encode(), IFF_TUN | IFF_NO_PI))
     ip("netns", "add", name)
-    ip("link", "set", f"hub{host}", "netns", name, "name", "wire")
+    ip("link", "set", interface, "netns", name, "name", "wire")
     inside = ["-n", name]
     # The second address stays when the first is deleted.
     ip("netns", "exec", name, "sysctl", "-qw", "net.ipv4.conf.all.promote_secondaries=1")

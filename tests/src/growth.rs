@@ -13,6 +13,8 @@ use crate::roles::LAYERS;
 pub const MAPS_HZ: f64 = 10.0;
 /// Heartbeats of a layer and announcements of a vehicle in a second.
 const BEATS_HZ: f64 = 1.0;
+/// Probes of the link that a server sends around a map with all layers; the router answers each.
+pub const PROBES: f64 = 2.0;
 
 /// A fleet on one machine: a server for each router, the vehicles spread over the servers, the readers of a vehicle
 /// over the routers, each two routers joined.
@@ -72,7 +74,7 @@ impl Size {
 
     /// Messages that all routers receive and send in a second. A message crosses to each router with a reader once.
     fn messages(&self) -> [f64; 2] {
-        let mut messages = [0.0; 2];
+        let (mut messages, mut probes_hz) = ([0.0; 2], 0.0);
         let mut add = |hz: f64, from: usize, readers: &[usize]| {
             let readers_in_all: usize = readers.iter().sum();
             let others =
@@ -87,11 +89,12 @@ impl Size {
             planners.for_each(|planner| readers[self.router_of(planner)] += 1);
             let maps_hz = if self.is_moving { MAPS_HZ } else { 0.0 };
             add(LAYERS.len() as f64 * (maps_hz + BEATS_HZ), from, &readers);
+            probes_hz += if readers.iter().any(|readers| *readers > 0) { PROBES * maps_hz } else { 0.0 };
             let other_servers: Vec<_> =
                 (0..self.routers).map(|router| usize::from(router != from && router < self.servers())).collect();
             add(BEATS_HZ, from, &other_servers);
         }
-        messages
+        messages.map(|of| of + probes_hz)
     }
 }
 
@@ -241,9 +244,11 @@ mod tests {
     fn a_message_crosses_to_each_router_with_a_reader_once() {
         // Vehicle 0 at router 0, vehicle 1 at router 1; all readers at router 0. Announcements cross too.
         let one_router_reads = Size { vehicles: 2, planners: 2, routers: 2, is_moving: true };
-        assert_eq!(one_router_reads.messages(), [2.0 * 11.0 * 3.0 + 2.0 * 2.0, 2.0 * 11.0 * 3.0 + 2.0 * 2.0]);
+        // Probes of both vehicles and their answers.
+        let probes = 2.0 * PROBES * MAPS_HZ;
+        assert_eq!(one_router_reads.messages(), [2.0 * 11.0 * 3.0 + 2.0 * 2.0 + probes; 2]);
         let both_read = Size { planners: 8, ..one_router_reads };
-        assert_eq!(both_read.messages(), [2.0 * 11.0 * 4.0 + 4.0, 2.0 * 11.0 * 10.0 + 4.0]);
+        assert_eq!(both_read.messages(), [2.0 * 11.0 * 4.0 + 4.0 + probes, 2.0 * 11.0 * 10.0 + 4.0 + probes]);
     }
 
     #[test]

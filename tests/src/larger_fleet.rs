@@ -4,7 +4,7 @@
 //! one vehicle at the rate of its maps; each two routers joined, so that a map crosses to each other router with a
 //! reader of it once. The routers are as many as one limit of [`Fleet`] asks for.
 
-use crate::growth::{MAPS_HZ, Model};
+use crate::growth::{MAPS_HZ, Model, PROBES};
 
 /// A fleet, and what one router may be given.
 #[derive(Clone, Copy, Debug)]
@@ -85,8 +85,10 @@ impl Fleet {
         let listing_routers = self.listing.min(routers);
         let announced = self.vehicles * self.listing;
         let announced_across = self.vehicles * (listing_routers - 1.0).max(0.0);
-        let received = maps_hz + crossing + self.vehicles + announced_across;
-        let sent = delivered + crossing + announced + announced_across;
+        // Probes of the link, and their answers.
+        let probes = self.vehicles * PROBES * MAPS_HZ;
+        let received = maps_hz + crossing + self.vehicles + announced_across + probes;
+        let sent = delivered + crossing + announced + announced_across + probes;
         // Of eleven messages of a layer ten are maps.
         let maps_sent = (delivered + crossing) * MAPS_HZ / (MAPS_HZ + 1.0);
         let announcements_sent = announced + announced_across;

@@ -15,13 +15,18 @@ const HOSTS: &str = "r1:1 r2:2 s1:11 s2:12 s3:13 p1:21 p2:22 w1:31";
 /// The endpoints of the routers r1 and r2.
 pub const ROUTERS: [&str; 2] = ["tcp/10.99.0.1:7447", "tcp/10.99.0.2:7447"];
 
+/// The name of a machine's network namespace, with the number of this process, because several runs may share a host.
+pub fn namespace(machine: &str) -> String {
+    format!("{machine}-{}", std::process::id())
+}
+
 /// A program in the namespace of a machine, by a clock that is this much ahead, such as `+2s`; empty: by the true one.
 ///
 /// # Panics
 /// If the clock is to be set and libfaketime is not installed.
 pub fn command(machine: &str, clock: &str, program: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new("ip");
-    command.args(["netns", "exec", machine]);
+    command.args(["netns", "exec", &namespace(machine)]);
     if !clock.is_empty() {
         let library = faketime().expect("libfaketime: apt-get install faketime");
         let settings = [format!("LD_PRELOAD={}", library.display()), format!("FAKETIME={clock}")];
@@ -49,7 +54,9 @@ impl Hub {
     fn start() -> Self {
         let script = crate::workspace().join("tests/python/hub.py");
         let mut command = Command::new("python3");
-        command.arg(script).args(HOSTS.split(' ')).stdin(Stdio::piped()).stdout(Stdio::piped());
+        let hosts = HOSTS.split(' ').filter_map(|host| host.split_once(':'));
+        let hosts = hosts.map(|(machine, host)| format!("{}:{host}", namespace(machine)));
+        command.arg(script).args(hosts).stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut process = command.spawn().expect("python3 is installed");
         let mut line = String::new();
         BufReader::new(process.stdout.take().expect("piped")).read_line(&mut line).expect("the hub lives");
@@ -148,12 +155,13 @@ impl Machines {
 
     /// Changes the link between two machines: its delay, and the share of packets that it loses.
     pub fn link(&mut self, first: &str, second: &str, delay_ms: u32, loss: f64) {
+        let (first, second) = (namespace(first), namespace(second));
         self.hub.rule(&format!("{first} {second} {delay_ms} {loss}"));
     }
 
     /// Limits what a machine sends, and what it receives, to a rate; 0: without a limit.
     pub fn limit(&mut self, machine: &str, kbit_s: u32) {
-        self.hub.rule(&format!("{machine} {kbit_s}"));
+        self.hub.rule(&format!("{} {kbit_s}", namespace(machine)));
     }
 }
 

@@ -351,3 +351,28 @@ async fn what_a_peer_publishes_on_a_wildcard_over_the_servers_keys_reaches_nobod
     }
     within("shutdown", running.shutdown()).await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
+async fn a_certificate_that_has_ended_is_named_in_the_status_while_serving_goes_on_until_a_new_one_is_read() {
+    let (folder, mut config) = (certificates("ours"), secured(true));
+    let whole = config.clone();
+    let of_server = config.grpc.tls.as_mut().expect("it has certificates");
+    (of_server.certificate, of_server.key) = (folder.join("expired.pem"), folder.join("expired.key"));
+    let running = start(config).await;
+    let named = || {
+        let reasons = running.vehicles.0[0].status.assess().reasons;
+        reasons.into_iter().find(|reason| reason.starts_with("the certificate of grpc.tls.certificate ended"))
+    };
+    until("the certificate is named", || named().is_some()).await;
+    assert!(named().is_some_and(|reason| reason.contains("clients refuse it")), "{:?}", named());
+    assert!(feed(&running, readings(3)).await > 0, "maps are made");
+    let reader = tls("ours", Some(("ours", "reader")));
+    assert!(vehicles(&running, &reader).await.is_err(), "a client refuses the certificate");
+
+    let read = whole.certificates(Path::new("")).expect("the certificates are there");
+    running.reload(&whole, read.as_ref()).expect("a certificate that holds");
+    until("the certificate is not named", || named().is_none()).await;
+    assert_eq!(vehicles(&running, &reader).await.unwrap(), 1);
+    within("shutdown", running.shutdown()).await.unwrap();
+}

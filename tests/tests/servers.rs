@@ -1,10 +1,11 @@
-//! Several servers in one zenoh network: each lists the vehicles of all, and leads planners to them.
+//! Several servers in one zenoh network: each lists the vehicles of all, and leads planners to them; and servers whose
+//! router is not there.
 
 mod fixture;
 
 use clearway::config::ZenohMode;
 use clearway::server::Running;
-use clearway_client::{Client, ClientError, Subscription};
+use clearway_client::{Client, ClientError, Subscription, ZenohClient};
 use fixture::routers::router;
 use fixture::{config, feed, readings, start, until, within};
 
@@ -101,4 +102,49 @@ async fn two_servers_that_claim_one_vehicle_are_both_listed_and_a_planner_keeps_
         within("shutdown", running.shutdown()).await.unwrap();
     }
     router.close().await.unwrap();
+}
+
+/// Waits until the status of a server's vehicle names a router that is away with all of these words, or none.
+async fn away(running: &Running, words: &[&str]) {
+    let is_named = || {
+        let reasons = running.vehicles.0[0].status.assess().reasons;
+        let named = reasons.iter().find(|reason| reason.starts_with("no zenoh router"));
+        named.map_or(words.is_empty(), |reason| !words.is_empty() && words.iter().all(|word| reason.contains(word)))
+    };
+    until(&format!("the router is named by {words:?}"), is_named).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_server_serves_without_its_router_names_it_and_has_readers_behind_it_once_it_is_there() {
+    // Nothing listens there now.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let at = format!("tcp/127.0.0.1:{port}");
+    let car = within("a server without its router", server("car", &at)).await;
+    let newest = within("a map over gRPC", client(&car).await.newest("car", &[])).await.unwrap();
+    assert_eq!(newest.header().boot_id, boot_id(&car));
+    away(&car, &[&at, "refused", "its readers get no maps"]).await;
+
+    let (first, _) = router(port, &[]).await;
+    let planner = within("zenoh", ZenohClient::connect(&at)).await.unwrap();
+    let mut maps = within("a stream", planner.subscribe("car", "drivability")).await.unwrap();
+    assert_eq!(within("a map over zenoh", maps.next()).await.unwrap().map.header().boot_id, boot_id(&car));
+    away(&car, &[]).await;
+    within("the router goes", first.close().into_future()).await.unwrap();
+    away(&car, &[&at, "refused"]).await;
+    let (second, _) = router(port, &[]).await;
+    away(&car, &[]).await;
+    within("shutdown", car.shutdown()).await.unwrap();
+    second.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_router_that_accepts_connections_and_no_session_is_named_while_serving_goes_on() {
+    let refuses = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let at = format!("tcp/{}", refuses.local_addr().unwrap());
+    let closing = tokio::spawn(async move { while refuses.accept().await.is_ok() {} });
+    let car = within("a server without a session", server("car", &at)).await;
+    assert!(within("a map over gRPC", client(&car).await.newest("car", &[])).await.is_ok());
+    away(&car, &[&at, "accepts connections but no session"]).await;
+    within("shutdown", car.shutdown()).await.unwrap();
+    closing.abort();
 }

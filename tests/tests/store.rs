@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
-use clearway::config::Recorder;
+use clearway::config::{Config, Recorder};
 use clearway::record::writer::{Files, Folder};
 use clearway::store::index::{Entry, Search, search};
 use clearway::store::{location, upload};
@@ -254,4 +254,43 @@ fn a_bucket_that_refuses_lies_or_vanishes_costs_no_recording() {
     let output = upload(&server);
     assert_eq!(output.status.code(), Some(2));
     assert!(recordings.join("c.mcap").exists(), "{}", text(&output.stderr));
+}
+
+#[test]
+#[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
+fn a_server_names_a_bucket_without_rights_serves_on_and_uploads_when_it_has_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), &["car-1.part-0001.mcap"]);
+    let mut bucket = S3::start();
+    bucket.fault("deny");
+    let mut config = Config::of_one_vehicle("car", "top");
+    let grpc = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    (config.grpc.listen, config.page.enabled, config.zenoh.enabled) = (grpc, false, false);
+    config.recorder.file = recordings.join("car.mcap");
+    (config.store.url, config.store.upload_kbit_s_max) = ("s3://fleet/kept".into(), 8000);
+    let file = folder.path().join("clearway.toml");
+    std::fs::write(&file, config.to_toml()).unwrap();
+    let mut serve = Command::new(binaries().join("clearway"));
+    let serve = serve.envs(bucket.environment()).args(["serve", "--config"]).arg(&file).stderr(Stdio::null());
+    let mut server = Stopped(serve.spawn().unwrap());
+    let grpc = grpc.to_string();
+    // The exit code says that no packet comes; the state would be the same without the store.
+    let mut status = || {
+        assert!(server.0.try_wait().unwrap().is_none(), "the server runs");
+        text(&clearway(&[], &["status", "--server", &grpc, "--json"]).stdout)
+    };
+    while !status().contains("403") {}
+    bucket.fault("none");
+    while status().contains("403") {}
+    assert_eq!(found(&bucket.environment(), "s3://fleet/kept", &[]), 1);
+}
+
+/// A process that ends when this is dropped.
+struct Stopped(Child);
+
+impl Drop for Stopped {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }

@@ -103,6 +103,16 @@ pub enum ConfigError {
         /// The key with the name in brackets.
         key: String,
     },
+    /// No vehicle has a name that was asked for.
+    #[error("configuration {}: there is no vehicle {name}; its vehicles: {known}", file.display())]
+    UnknownVehicle {
+        /// The configuration file.
+        file: PathBuf,
+        /// The name.
+        name: String,
+        /// The names of the vehicles, separated by commas.
+        known: String,
+    },
     /// A table has no such key.
     #[error("{origin}: {key} is not a key; its table has: {known}")]
     UnknownKey {

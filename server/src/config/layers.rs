@@ -82,6 +82,14 @@ impl Node {
 }
 
 impl Layers {
+    /// Keeps the vehicles of these names alone; all if there are no names.
+    pub fn select(&mut self, names: &[String]) {
+        let is_selected = |vehicle: &Node| vehicle.name().is_some_and(|name| names.iter().any(|of| of == name));
+        if let Some(Node::List(vehicles)) = self.0.get_mut("vehicle").filter(|_| !names.is_empty()) {
+            vehicles.retain(is_selected);
+        }
+    }
+
     /// The layer of the file. `table` is the table of `text`.
     pub fn of_file(text: &str, table: &Table, file: &Path) -> Self {
         let Ok(lines) = DeTable::parse(text) else { return Self(BTreeMap::new()) };

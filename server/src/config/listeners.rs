@@ -127,7 +127,7 @@ pub(super) fn check(vehicles: &[Vehicle]) -> Result<(), ValueError> {
         if let Some((a, b)) = listener.ambiguous() {
             let sensor = |route: Route| &vehicles[route.vehicle].sensors[usize::from(route.source)].name;
             let vehicle = |route: Route| &vehicles[route.vehicle].name;
-            let allowed = format!(
+            let mut allowed = format!(
                 "a sender of its own, or ports of its own, for each sensor at {}: {} of {} and {} of {} cannot be distinguished",
                 listener.at,
                 sensor(a),
@@ -135,7 +135,10 @@ pub(super) fn check(vehicles: &[Vehicle]) -> Result<(), ValueError> {
                 sensor(b),
                 vehicle(b)
             );
-            let value = b.from.or(a.from).map_or("(nothing)".to_owned(), |from| format!("{from:?}"));
+            if a.vehicle != b.vehicle {
+                allowed += "; `--vehicle NAME` uses one vehicle of the file alone";
+            }
+            let value = b.from.or(a.from).map_or("(nothing)".to_owned(), |from| from.to_string());
             return Err(ValueError::new(format!("vehicle.udp.from (of {})", vehicle(b)), value, allowed));
         }
     }

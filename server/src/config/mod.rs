@@ -164,7 +164,15 @@ impl Config {
     /// # Errors
     /// [`ConfigError::Read`] if the file cannot be read, and the errors of [`Config::parse`].
     pub fn load(file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        Self::parse(&text_of(file)?, file, overrides)
+        Self::load_vehicles(file, overrides, &[])
+    }
+
+    /// As [`Config::load`], with the vehicles of these names alone; with all if there are no names.
+    ///
+    /// # Errors
+    /// As [`Config::load`], and [`ConfigError::UnknownVehicle`] for a name that no vehicle has.
+    pub fn load_vehicles(file: &Path, overrides: &[String], vehicles: &[String]) -> Result<Self, ConfigError> {
+        Self::parse_vehicles(&text_of(file)?, file, overrides, vehicles)
     }
 
     /// Like [`Config::load`], from a text; errors name `file`.
@@ -174,14 +182,20 @@ impl Config {
     /// override is not `key=value` or its key goes on below a value; [`ConfigError::UnknownKey`],
     /// [`ConfigError::MissingKey`] and [`ConfigError::Value`] for the first key or value that is not allowed.
     pub fn parse(text: &str, file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        Self::parse_vehicles(text, file, overrides, &[])
+    }
+
+    fn parse_vehicles(text: &str, file: &Path, overrides: &[String], vehicles: &[String]) -> Result<Self, ConfigError> {
         let syntax = |source| ConfigError::Syntax { file: file.to_owned(), source: Box::new(source) };
         let table: toml::Table = toml::from_str(text).map_err(syntax)?;
-        let config = Self::of_file(text, &table, file)?;
+        let mut config = Self::of_file(text, &table, file)?;
+        config.select(vehicles, file)?;
         if overrides.is_empty() {
             config.check(&Origin::file(file))?;
             return Ok(config);
         }
         let mut layers = Layers::of_file(text, &table, file);
+        layers.select(vehicles);
         overrides.iter().try_for_each(|text| set(&mut layers, text))?;
         inherit(&mut layers, |key| Origin::Options(blamed(overrides, key)))?;
         let table = layers.into_table();
@@ -200,6 +214,17 @@ impl Config {
             error.at(&origin)
         })?;
         Ok(overridden)
+    }
+
+    /// Keeps the vehicles of these names alone; all if there are no names.
+    fn select(&mut self, names: &[String], file: &Path) -> Result<(), ConfigError> {
+        if let Some(name) = names.iter().find(|name| self.vehicles.iter().all(|vehicle| vehicle.name != **name)) {
+            let known: Vec<_> = self.vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect();
+            let (file, name) = (file.to_owned(), name.clone());
+            return Err(ConfigError::UnknownVehicle { file, name, known: known.join(", ") });
+        }
+        self.vehicles.retain(|vehicle| names.is_empty() || names.contains(&vehicle.name));
+        Ok(())
     }
 
     /// The configuration of the file alone; its values are not checked yet.
@@ -223,13 +248,14 @@ impl Config {
     /// The configuration as TOML, with every default, and behind each other value where it was given.
     ///
     /// # Errors
-    /// As [`Config::load`].
-    pub fn explain(file: &Path, overrides: &[String]) -> Result<String, ConfigError> {
+    /// As [`Config::load_vehicles`].
+    pub fn explain(file: &Path, overrides: &[String], vehicles: &[String]) -> Result<String, ConfigError> {
         let text = text_of(file)?;
-        let config = Self::parse(&text, file, overrides)?;
+        let config = Self::parse_vehicles(&text, file, overrides, vehicles)?;
         // The text has been parsed, and its layers have been merged.
         let table: toml::Table = toml::from_str(&text).unwrap_or_default();
         let mut layers = Layers::of_file(&text, &table, file);
+        layers.select(vehicles);
         overrides.iter().try_for_each(|text| set(&mut layers, text))?;
         inherit(&mut layers, |_| Origin::file(file))?;
         Ok(explain::explained(&config.to_toml(), &layers.given()))

@@ -198,7 +198,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         assert!(error.contains("clearway.toml") && error.contains(allowed), "{to}: {error}");
     }
     for url in ["", "/mnt/archive", "file:///mnt/archive", "s3://fleet", "s3://fleet/clearway"] {
-        assert!(Store { url: url.into(), delete: false }.check().is_ok(), "{url}");
+        assert!(Store { url: url.into(), ..Store::default() }.check().is_ok(), "{url}");
     }
     assert!(error("").contains("at least one [[vehicle]]"));
     assert!(error(&NEEDED.replace("z_m = 1.9\n", "")).contains("z_m"), "a missing transform is an error");
@@ -445,4 +445,29 @@ fn variables_and_options_override_keys_of_all_vehicles_or_of_one() {
     assert!(refused("$CLEARWAY__GRPC__LISTE=1").starts_with(start), "{}", refused("$CLEARWAY__GRPC__LISTE=1"));
     let start = "--set vehicle_defaults.queue=3: vehicle.queue (of first) = 3: allowed: 16";
     assert!(refused("vehicle_defaults.queue=3").starts_with(start), "{}", refused("vehicle_defaults.queue=3"));
+}
+
+#[test]
+fn one_file_has_vehicles_with_the_same_addresses_of_which_each_server_uses_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("fleet.toml");
+    let defaults = "[vehicle_defaults.udp]\ndata = \"0.0.0.0:2368\"\n[vehicle_defaults.udp.from]\n\
+        top = \"192.168.1.201\"\n[[vehicle_defaults.sensor]]\nname = \"top\"\n\
+        [vehicle_defaults.sensor.extrinsics]\nx_m = 0.0\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\n\
+        yaw_deg = 0.0\n";
+    let vehicles = "[[vehicle]]\nname = \"car1\"\n[[vehicle]]\nname = \"car2\"\n[vehicle.maps]\nvalid_ms = 250\n";
+    std::fs::write(&file, format!("{defaults}{vehicles}")).unwrap();
+    let all = Config::load(&file, &[]).unwrap_err().to_string();
+    assert!(all.contains("= 192.168.1.201: ") && all.contains("`--vehicle NAME` uses one vehicle"), "{all}");
+    let (car2, none) = (["car2".to_owned()], Vec::new());
+    let names = |config: &Config| config.vehicles.iter().map(|vehicle| vehicle.name.clone()).collect::<Vec<_>>();
+    let config = Config::load_vehicles(&file, &none, &car2).unwrap();
+    assert_eq!((names(&config), config.vehicles[0].maps.valid_ms), (car2.to_vec(), 250));
+    // An override without a name means the first vehicle that is used.
+    let config = Config::load_vehicles(&file, &["vehicle.maps.valid_ms=200".into()], &car2).unwrap();
+    assert_eq!((names(&config), config.vehicles[0].maps.valid_ms), (car2.to_vec(), 200));
+    let explained = Config::explain(&file, &none, &car2).unwrap();
+    assert!(explained.contains("name = \"car2\"  # fleet.toml:17\n") && !explained.contains("car1"), "{explained}");
+    let unknown = Config::load_vehicles(&file, &none, &["car3".into()]).unwrap_err().to_string();
+    assert!(unknown.ends_with("there is no vehicle car3; its vehicles: car1, car2"), "{unknown}");
 }

@@ -62,6 +62,15 @@ pub enum Sender {
     Socket(SocketAddr),
 }
 
+impl std::fmt::Display for Sender {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Address(address) => address.fmt(f),
+            Self::Socket(socket) => socket.fmt(f),
+        }
+    }
+}
+
 impl Sender {
     /// True if `peer` is this sender; an IPv4 peer must not be given as a mapped IPv6 address.
     pub fn matches(&self, peer: SocketAddr) -> bool {

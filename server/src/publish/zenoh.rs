@@ -303,21 +303,24 @@ async fn send_maps(
                     let _hop = served.status.traces.hop(&map, "send", Some(Transport::Zenoh.as_str()));
                     // Without a subscriber nothing travels.
                     let probes = probes.as_ref().filter(|_| served.status.transports.count(Transport::Zenoh) > 0);
-                    let before = probe(probes).await;
+                    let (at, before) = (Instant::now(), probe(probes).await);
                     send_map(&map, &publishers, signing_key.as_deref()).await;
                     if let (Some(before), Some(after)) = (before, probe(probes).await) {
+                        note_unanswered(&pace, &served);
                         pace.sent(Instant::now());
-                        on_the_way.push(passed(pace.count(), Some(before), after));
+                        on_the_way.push(passed(pace.count(), Some((at, before)), after));
                     }
                 }
             }
             Some(passed) = on_the_way.next() => {
-                if let Some((count, transmission)) = passed {
+                if let Some(Passed { count, transmission, took }) = passed {
                     pace.arrived(Instant::now(), count, transmission);
+                    took.into_iter().for_each(|took| served.status.network.note_link(Instant::now(), took));
                 }
             }
             () = tokio::time::sleep(wait.unwrap_or(REPEAT)), if wait != Some(Duration::ZERO) => {
                 if let (None, Some(again)) = (wait, probe(probes.as_ref()).await) {
+                    note_unanswered(&pace, &served);
                     on_the_way.push(passed(pace.count(), None, again));
                 }
             }
@@ -333,15 +336,36 @@ async fn send_maps(
     std::future::pending::<()>().await;
 }
 
-/// Waits until the first `count` maps have passed the link: these, and how long it took for the last of them, between
-/// the two probes around it. `None` if a probe is not answered.
-async fn passed(count: u64, before: Option<Probe>, after: Probe) -> Option<(u64, Option<Duration>)> {
+/// Maps that have passed the link.
+struct Passed {
+    /// The first maps, by their number.
+    count: u64,
+    /// Time that the link took for the last of them alone, if that is known.
+    transmission: Option<Duration>,
+    /// The same with the time in the queue of the link, from when it was sent.
+    took: Option<Duration>,
+}
+
+/// Waits until the first `count` maps have passed the link, by the probes before and after the last of them; the first
+/// was sent at this time. `None` if a probe is not answered.
+async fn passed(count: u64, before: Option<(Instant, Probe)>, after: Probe) -> Option<Passed> {
     let before = match before {
-        Some(before) => Some(before.answered().await?),
+        Some((at, before)) => Some((at, before.answered().await?)),
         None => None,
     };
     let after = after.answered().await?;
-    Some((count, before.map(|before| after.duration_since(before))))
+    let transmission = before.map(|(_, before)| after.duration_since(before));
+    Some(Passed { count, transmission, took: before.map(|(at, _)| after.duration_since(at)) })
+}
+
+/// Notes how long the link has taken until now for the map on the way, if that is more than the last one took.
+fn note_unanswered(pace: &Pace, served: &Served) {
+    let (now, network) = (Instant::now(), &served.status.network);
+    if let Some(unanswered) = pace.unanswered(now)
+        && network.link(now).is_none_or(|took| took < unanswered)
+    {
+        network.note_link(now, unanswered);
+    }
 }
 
 /// Sends a probe of the link, if maps are paced by it.

@@ -66,9 +66,14 @@ impl Pace {
         }
     }
 
+    /// Time for which no probe has been answered, although maps were sent.
+    pub fn unanswered(&self, now: Instant) -> Option<Duration> {
+        self.unanswered_since.map(|since| now.saturating_duration_since(since))
+    }
+
     /// True if no probe has been answered for long, although maps were sent.
     pub fn is_silent(&self, now: Instant) -> bool {
-        self.unanswered_since.is_some_and(|since| now.saturating_duration_since(since) >= SILENCE)
+        self.unanswered(now).is_some_and(|unanswered| unanswered >= SILENCE)
     }
 
     /// Time from now until the next map may be sent; `None` if one must arrive before.

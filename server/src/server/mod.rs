@@ -11,11 +11,17 @@
 //! | `save_rules` | stale maps and lost sensors -> saves of the recording |
 //! | `uploads` | finished parts of the recording -> the store |
 //! | `over_zenoh` | everything that uses the zenoh session |
+//! | `opening` | a router that answers, at the start or later -> the session |
+//! | `router` | whether a router is connected -> status and log |
 
 mod input;
 mod listeners;
 #[cfg(feature = "zenoh")]
+mod opening;
+#[cfg(feature = "zenoh")]
 mod over_zenoh;
+#[cfg(feature = "zenoh")]
+mod router;
 mod running;
 mod save_rules;
 mod setup;

@@ -6,10 +6,11 @@ use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::pubsub::Subscriber;
 
-use super::input::VehicleInput;
+use super::router::watch_router;
 use crate::config::{Config, ZenohMode};
 use crate::fleet::Fleet;
 use crate::ingest::gateway::Gateways;
+use crate::ingest::queue::EventQueue;
 use crate::ingest::ros::live::{self, LiveTopics};
 use crate::ingest::zenoh::{Ingest, Senders};
 use crate::publish::listen::access::Access;
@@ -18,6 +19,20 @@ use crate::publish::{Vehicles, announcements, zenoh_recorder};
 use crate::record::writer::RecorderControl;
 use crate::zenoh_session::{self, ZenohError};
 
+/// What of a server uses the session.
+#[derive(Clone)]
+pub(super) struct Users {
+    pub config: Config,
+    pub vehicles: Vehicles,
+    pub gateways: Gateways,
+    /// The event queue of each vehicle.
+    pub queues: Vec<EventQueue>,
+    /// The vehicles of other servers.
+    pub fleet: Fleet,
+    /// The address at which gRPC listens.
+    pub grpc: Option<SocketAddr>,
+}
+
 /// The open session and its users.
 pub(super) struct OverZenoh {
     session: Session,
@@ -25,7 +40,7 @@ pub(super) struct OverZenoh {
     /// One task a vehicle.
     ingest: JoinSet<()>,
     ros: Vec<LiveTopics>,
-    /// One task a vehicle.
+    /// One task a vehicle, and one that watches the router.
     announcements: JoinSet<()>,
     /// One task a vehicle.
     recorder: JoinSet<()>,
@@ -33,25 +48,21 @@ pub(super) struct OverZenoh {
 }
 
 impl OverZenoh {
-    /// Opens the session, publishes all vehicles, and subscribes to their observations and ROS 2 topics. Announces the
+    /// Publishes all vehicles on an open session, and subscribes to their observations and ROS 2 topics. Announces the
     /// vehicles with the address at which gRPC listens, and fills the fleet with those of others.
     ///
     /// # Errors
-    /// [`ZenohError`] if the session cannot be opened or a key cannot be declared.
-    pub(super) async fn start(
-        config: &Config,
-        vehicles: &Vehicles,
-        gateways: &Gateways,
-        inputs: &[VehicleInput],
-        (fleet, grpc): (&Fleet, Option<SocketAddr>),
-    ) -> Result<Self, ZenohError> {
-        let names = config.vehicles.iter().map(|vehicle| &*vehicle.name);
-        let session = zenoh_session::open(&config.zenoh, gateways.message_bytes_max(), names).await?;
+    /// [`ZenohError`] if a key cannot be declared.
+    pub(super) async fn start(session: Session, users: &Users) -> Result<Self, ZenohError> {
+        let Users { config, vehicles, gateways, queues, fleet, grpc } = users;
         let publisher = Publisher::start(&session, &config.zenoh, vehicles).await?;
         let mut announcements = JoinSet::new();
         if config.zenoh.fleet.announce {
             let address = grpc.and_then(|bound| config.grpc.advertised(bound)).unwrap_or_default();
             announcements::announce(&session, vehicles, (&address, &config.page.advertise), &mut announcements).await?;
+        }
+        if config.zenoh.mode == ZenohMode::Client {
+            announcements.spawn(watch_router(session.clone(), config.zenoh.connect.clone(), vehicles.clone()));
         }
         let others = match config.zenoh.fleet.list {
             true => Some(announcements::hear(&session, fleet.clone()).await?),
@@ -64,10 +75,10 @@ impl OverZenoh {
             let ingest = Ingest::subscribe(&over_zenoh.session, gateway.clone(), senders).await?;
             over_zenoh.ingest.spawn(ingest.run());
         }
-        for (vehicle, input) in config.vehicles.iter().zip(inputs) {
+        for (vehicle, queue) in config.vehicles.iter().zip(queues) {
             let Some(ros) = &vehicle.ros else { continue };
             let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
-            let topics = live::subscribe(&over_zenoh.session, ros, &vehicle.name, sensors, input.queue.clone()).await?;
+            let topics = live::subscribe(&over_zenoh.session, ros, &vehicle.name, sensors, queue.clone()).await?;
             over_zenoh.ros.push(topics);
         }
         Ok(over_zenoh)

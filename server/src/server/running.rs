@@ -68,7 +68,10 @@ pub struct Running {
     pub(super) listeners: Option<(Security, Vec<(&'static str, ListenerHandle)>)>,
     pub(super) traces: Traces,
     #[cfg(feature = "zenoh")]
-    pub(super) over_zenoh: Option<super::over_zenoh::OverZenoh>,
+    pub(super) connected: super::opening::Connected,
+    /// Waits for the router.
+    #[cfg(feature = "zenoh")]
+    pub(super) connecting: JoinSet<()>,
 }
 
 impl Running {
@@ -150,8 +153,11 @@ impl Running {
             let _ = tokio::task::spawn_blocking(move || threads.stop()).await;
         }
         #[cfg(feature = "zenoh")]
-        if let Some(over_zenoh) = &mut self.over_zenoh {
-            over_zenoh.stop_ros().await;
+        {
+            self.connecting.shutdown().await;
+            if let Some(over_zenoh) = &mut *self.connected.0.lock().await {
+                over_zenoh.stop_ros().await;
+            }
         }
         begin("the event queues");
         let inputs = std::mem::take(&mut self.inputs);
@@ -175,7 +181,7 @@ impl Running {
             publishers.shutdown().await;
         }
         #[cfg(feature = "zenoh")]
-        if let Some(over_zenoh) = self.over_zenoh
+        if let Some(over_zenoh) = self.connected.0.lock().await.take()
             && tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, over_zenoh.stop()).await.is_err()
         {
             tracing::warn!("zenoh did not close in time");

@@ -2,6 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{BuildHasher, Hasher};
+#[cfg(feature = "zenoh")]
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 use std::time::Duration;
@@ -13,12 +15,18 @@ use tokio::sync::watch;
 
 use super::input::VehicleInput;
 use super::listeners::Listeners;
+#[cfg(feature = "zenoh")]
+use super::opening::Opening;
+#[cfg(feature = "zenoh")]
+use super::over_zenoh::{OverZenoh, Users};
 use super::running::Running;
 use super::save_rules;
 use super::setup::{Setup, StartError};
 #[cfg(feature = "store")]
 use super::uploads;
 use crate::base::held_sockets::HeldSockets;
+#[cfg(feature = "zenoh")]
+use crate::config::ZenohMode;
 use crate::config::{self, Certificates, Config, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
@@ -32,6 +40,8 @@ use crate::record::mcap_file::Header;
 use crate::record::writer::{Recorder, recording_path};
 use crate::status::{VehicleStatus, watch_states};
 use crate::traces::Traces;
+#[cfg(feature = "zenoh")]
+use crate::zenoh_session;
 
 /// Longest time between two signs of life of a listener that does not hang: it gives one twice a second.
 const LISTENER_SILENT_MAX: Duration = Duration::from_secs(3);
@@ -145,23 +155,21 @@ impl Running {
         drop(held);
         let gateways = self.gateways(config);
         #[cfg(feature = "zenoh")]
+        let mut opening = None;
+        #[cfg(feature = "zenoh")]
         if config.zenoh.enabled {
-            let started = super::over_zenoh::OverZenoh::start(
-                config,
-                &self.vehicles,
-                &gateways,
-                &self.inputs,
-                (&self.fleet, listeners.grpc_address()),
-            );
-            let over_zenoh = started.await?;
-            self.zenoh = over_zenoh.endpoints().await;
-            self.over_zenoh = Some(over_zenoh);
+            opening = self.start_zenoh(config, &gateways, listeners.grpc_address()).await?;
         }
         self.start_engines(config, prepared, driver, header)?;
         #[cfg(feature = "zenoh")]
-        if let Some(over_zenoh) = &mut self.over_zenoh {
+        {
             let control = self.recorder.as_ref().map(Recorder::control);
-            over_zenoh.serve_recorder(config, control.as_ref()).await?;
+            if let Some(over_zenoh) = &mut *self.connected.0.lock().await {
+                over_zenoh.serve_recorder(config, control.as_ref()).await?;
+            }
+            if let Some((opening, users)) = opening {
+                self.connecting.spawn(opening.finish(users, control, self.connected.clone()));
+            }
         }
         if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
             let (rules, stopped) =
@@ -184,6 +192,34 @@ impl Running {
         self.start_udp(sockets)
     }
 
+    /// Opens the zenoh session and starts what uses it. A router that does not answer is waited for later: then the
+    /// attempts are returned.
+    #[cfg(feature = "zenoh")]
+    async fn start_zenoh(
+        &mut self,
+        config: &Config,
+        gateways: &Gateways,
+        grpc: Option<SocketAddr>,
+    ) -> Result<Option<(Opening, Users)>, StartError> {
+        let names = config.vehicles.iter().map(|vehicle| &*vehicle.name);
+        let settings = zenoh_session::settings(&config.zenoh, gateways.message_bytes_max(), names)?;
+        let queues = self.inputs.iter().map(|input| input.queue.clone()).collect();
+        let (vehicles, fleet) = (self.vehicles.clone(), self.fleet.clone());
+        let users = Users { config: config.clone(), vehicles, gateways: gateways.clone(), queues, fleet, grpc };
+        let session = match config.zenoh.mode {
+            ZenohMode::Client => {
+                let mut opening = Opening::begin(settings, &users);
+                let Some(session) = opening.first().await else { return Ok(Some((opening, users))) };
+                session
+            }
+            ZenohMode::Peer | ZenohMode::Router => zenoh_session::open(settings, &config.zenoh).await?,
+        };
+        let over_zenoh = OverZenoh::start(session, &users).await?;
+        self.zenoh = over_zenoh.endpoints().await;
+        *self.connected.0.lock().await = Some(over_zenoh);
+        Ok(None)
+    }
+
     /// Starts the recorder, if the configuration names a file, and the engines.
     fn start_engines(
         &mut self,
@@ -200,7 +236,11 @@ impl Running {
             if options.awaits_store {
                 let saved = Duration::from_secs(config.recorder.save_s);
                 let (control, counts) = (recorder.control(), recorder.counts());
-                let uploads = uploads::upload_finished(config.store.clone(), saved, control.clone(), counts);
+                let validity = |vehicle: &Vehicle| Duration::from_millis(vehicle.maps.valid_ms.into());
+                let valid = config.vehicles.iter().map(validity).collect();
+                let rate = uploads::rate(&config.store, &self.vehicles, valid);
+                let store = (config.store.clone(), rate);
+                let uploads = uploads::upload_finished(store, saved, control.clone(), counts);
                 let (stopped, runtime) = (self.stopped(), tokio::runtime::Handle::current());
                 // What the store has not confirmed at the end stays, and the next start sends it. On a thread of its
                 // own, because it reads whole files.
@@ -249,7 +289,8 @@ impl Running {
         let Listeners { grpc, page, metrics, foxglove, security, handles, .. } = listeners;
         let listeners = handles.clone().into();
         let (vehicles, replay) = (self.vehicles.clone(), self.replay.clone());
-        self.publishers.spawn(watch_listeners(handles.clone(), vehicles.clone(), self.stopped()));
+        let watched = (security.clone(), handles.clone());
+        self.publishers.spawn(watch_listeners(watched, vehicles.clone(), self.stopped()));
         let (fleet, summaries) = (self.fleet.clone(), page::Summaries::default());
         let recorder = self.recorder.as_ref().map(Recorder::control);
         let shown = page::Shown { vehicles, fleet, listeners, replay, recorder: recorder.clone(), summaries };
@@ -290,9 +331,10 @@ impl Running {
     }
 }
 
-/// Names a listener that hangs or has stopped in the status of every vehicle, until `stop` resolves.
+/// Names a listener that hangs or has stopped, and the ends of certificates, in the status of every vehicle, until
+/// `stop` resolves.
 async fn watch_listeners(
-    handles: Vec<(&'static str, ListenerHandle)>,
+    (security, handles): (Security, Vec<(&'static str, ListenerHandle)>),
     vehicles: Vehicles,
     stop: impl Future<Output = ()>,
 ) {
@@ -304,7 +346,12 @@ async fn watch_listeners(
             let silent = handles.iter().filter_map(|(name, handle)| Some((name, silent(handle)?)));
             let fault = silent.map(|(name, silent)| format!("the listener {name} has hung for {} s", silent.as_secs()));
             let fault = fault.collect::<Vec<_>>().join("; ");
-            vehicles.0.iter().for_each(|served| served.status.set_listener_fault(&fault));
+            let current = security.current();
+            let ends = current.tls.as_ref().map_or(&[][..], |tls| &tls.ends_s);
+            for served in vehicles.0.iter() {
+                served.status.network.set_listener_fault(&fault);
+                served.status.network.set_certificates(ends);
+            }
         }
     };
     tokio::select! {
@@ -373,7 +420,7 @@ mod tests {
         let status = VehicleStatus::new("car".into(), 1, Vec::new(), event_queue(1).0.drops());
         let (status, (_, newest)) = (Arc::new(status), watch::channel(None));
         let vehicles = Vehicles([Served { status: status.clone(), newest }].into());
-        let watching = tokio::spawn(watch_listeners(handles.clone(), vehicles, pending()));
+        let watching = tokio::spawn(watch_listeners((security, handles.clone()), vehicles, pending()));
 
         let of_listener = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let of_listener = of_listener.expect("a thread");

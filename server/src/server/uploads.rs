@@ -9,8 +9,10 @@ use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt};
 
 use crate::config::Store;
+use crate::publish::Vehicles;
 use crate::record::writer::{RecorderControl, RecorderCounts};
 use crate::store::location;
+use crate::store::rate::UploadRate;
 use crate::store::upload::{self, Prepared, UploadError};
 
 /// Time between two looks for finished parts, and the first between two attempts with a store that is away; each
@@ -42,6 +44,7 @@ struct Uploads {
     control: RecorderControl,
     counts: Arc<RecorderCounts>,
     store: Option<Arc<dyn ObjectStore>>,
+    rate: UploadRate,
     answer_timeout: Duration,
     /// Parts that the store has confirmed, and those without an event or a map.
     settled: BTreeSet<Seen>,
@@ -49,15 +52,28 @@ struct Uploads {
     prepared: BTreeMap<Seen, Prepared>,
 }
 
-/// Sends each finished part to the store until the task is aborted. What the store does not confirm stays, and is sent
+/// A rate of uploads that gives way to the maps of these vehicles, with the validity of each, on the link to the zenoh
+/// router.
+pub(super) fn rate(options: &Store, vehicles: &Vehicles, valid: Vec<Duration>) -> UploadRate {
+    let vehicles = vehicles.clone();
+    let share = move || {
+        let now = Instant::now();
+        let took = vehicles.0.iter().map(|served| served.status.network.link(now));
+        let shares = took.zip(&valid).filter_map(|(took, valid)| Some(took?.div_duration_f64(*valid)));
+        shares.reduce(f64::max)
+    };
+    UploadRate::new(options.upload_kbit_s_max, Arc::new(share))
+}
+
+/// Sends each finished part to the store, at this rate, until the task is aborted. What the store does not confirm stays, and is sent
 /// again. With `delete`, what it confirms is deleted once it is older than `saved`.
 pub(super) async fn upload_finished(
-    options: Store,
+    (options, rate): (Store, UploadRate),
     saved: Duration,
     control: RecorderControl,
     counts: Arc<RecorderCounts>,
 ) {
-    let mut uploads = Uploads::new(options, saved, control, counts);
+    let mut uploads = Uploads { rate, ..Uploads::new(options, saved, control, counts) };
     let mut period = PERIOD;
     loop {
         let problem = uploads.upload_all().await.err();
@@ -99,7 +115,8 @@ fn period_after(period: Duration, problem: Option<&Problem>) -> Duration {
 impl Uploads {
     fn new(options: Store, saved: Duration, control: RecorderControl, counts: Arc<RecorderCounts>) -> Self {
         let (store, settled, prepared) = (None, BTreeSet::new(), BTreeMap::new());
-        Self { options, saved, control, counts, store, answer_timeout: ANSWER_TIMEOUT, settled, prepared }
+        let (rate, answer_timeout) = (UploadRate::unlimited(), ANSWER_TIMEOUT);
+        Self { options, saved, control, counts, store, rate, answer_timeout, settled, prepared }
     }
 
     /// Sends the parts that wait, up to the first that the store refuses.
@@ -184,7 +201,9 @@ impl Uploads {
         }
         let store = match &self.store {
             Some(store) => store.clone(),
-            None => location::open(&self.options.url).map_err(|error| Problem::Store(error.to_string()))?,
+            None => {
+                location::open_at(&self.options.url, &self.rate).map_err(|error| Problem::Store(error.to_string()))?
+            }
         };
         self.store = Some(store.clone());
         // Also a refusal is an answer: the part's own request then fails with the same reason.
@@ -193,7 +212,8 @@ impl Uploads {
             let reason = format!("{} has not answered for {:?}", self.options.url, self.answer_timeout);
             return Err(Problem::Store(reason));
         }
-        upload::upload_prepared(&*store, part, &self.prepared[seen]).await.map_err(|error| match error {
+        let uploaded = upload::upload_prepared(&*store, part, &self.prepared[seen], &self.rate).await;
+        uploaded.map_err(|error| match error {
             UploadError::Store { .. } | UploadError::Differs { .. } => Problem::Store(error.to_string()),
             error => of_part(error),
         })?;
@@ -223,7 +243,7 @@ mod tests {
         let (recorder, _handles) = Recorder::start(&options, &Header::default(), false).unwrap();
         let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/drive.mcap");
         std::fs::copy(golden, folder.path().join("car-1.part-0001.mcap")).unwrap();
-        let store = Store { url: "s3://drives".into(), delete: false };
+        let store = Store { url: "s3://drives".into(), ..Store::default() };
         let mut uploads = Uploads::new(store, Duration::ZERO, recorder.control(), recorder.counts());
         let hangs = ThrottleConfig { wait_get_per_call: Duration::from_secs(3600), ..ThrottleConfig::default() };
         uploads.store = Some(Arc::new(ThrottledStore::new(InMemory::new(), hangs)));
@@ -244,7 +264,7 @@ mod tests {
         let options = Options { file: at("car.mcap"), ..Options::default() };
         let (recorder, handles) = Recorder::start(&options, &Header::default(), false).unwrap();
         let counts = recorder.counts();
-        let store = Store { url: at("store").display().to_string(), delete: false };
+        let store = Store { url: at("store").display().to_string(), ..Store::default() };
         let mut uploads = Uploads::new(store, Duration::ZERO, recorder.control(), counts.clone());
         add(1);
         assert!(uploads.upload_all().await.is_ok());

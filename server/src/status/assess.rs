@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures::future::select_all;
 use tokio::sync::watch;
@@ -132,6 +132,7 @@ impl VehicleStatus {
             loss,
             recorder_problem: self.recorder_problem(),
             store_problem: self.recorder.get().and_then(|counts| counts.store_problem()),
+            network_problems: self.network.problems(Instant::now(), now_ns()),
             claimed_by,
         }
     }

@@ -77,6 +77,8 @@ pub struct Facts {
     pub recorder_problem: Option<String>,
     /// What is wrong with the long-term store.
     pub store_problem: Option<String>,
+    /// What is wrong with the server's network.
+    pub network_problems: Vec<String>,
     /// Other servers that serve a vehicle of the same name.
     pub claimed_by: Vec<String>,
 }
@@ -177,6 +179,9 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
         add(State::Warn, format!("recorder: {problem}"));
     }
     if let Some(problem) = &facts.store_problem {
+        add(State::Warn, problem.clone());
+    }
+    for problem in &facts.network_problems {
         add(State::Warn, problem.clone());
     }
     for server in &facts.claimed_by {
@@ -289,7 +294,7 @@ fn sensor_findings(sensor: &SensorFacts, add: &mut impl FnMut(State, String)) {
 }
 
 /// A duration for people: tenths of a second below ten seconds.
-fn seconds(duration: Duration) -> String {
+pub(super) fn seconds(duration: Duration) -> String {
     let seconds = duration.as_secs_f64();
     if seconds < 9.95 { format!("{seconds:.1} s") } else { format!("{seconds:.0} s") }
 }

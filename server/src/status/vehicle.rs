@@ -24,6 +24,7 @@ use crate::traces::Traces;
 
 use super::health::{Health, State};
 use super::histogram::Histogram;
+use super::network::Network;
 use super::notices::Notices;
 use super::transports::{Readers, Transport};
 use super::window::{PacketCounts, STAGES, StageTimes, Window};
@@ -74,7 +75,8 @@ pub struct VehicleStatus {
     pub(super) health: Mutex<Health>,
     pub(super) health_state: watch::Sender<State>,
     engine_stopped: AtomicBool,
-    listener_fault: Mutex<String>,
+    /// The listeners, the router and the certificates of its server.
+    pub network: Network,
     /// Time of the newest sign of life of the engine, in ms after `started`; 0 before the first.
     engine_beat_ms: AtomicU64,
     pub(super) started: Instant,
@@ -221,7 +223,7 @@ impl VehicleStatus {
             health: Mutex::default(),
             health_state: watch::Sender::new(State::default()),
             engine_stopped: AtomicBool::new(false),
-            listener_fault: Mutex::default(),
+            network: Network::default(),
             engine_beat_ms: AtomicU64::new(0),
             started: Instant::now(),
             changing: Mutex::default(),
@@ -313,9 +315,8 @@ impl VehicleStatus {
         if !beat.is_zero() && silent > ENGINE_SILENT_MAX {
             return Some(format!("the engine of vehicle {} has hung for {} s", self.name, silent.as_secs()));
         }
-        let listener_fault = locked(&self.listener_fault).clone();
-        if !listener_fault.is_empty() {
-            return Some(listener_fault);
+        if let Some(fault) = self.network.listener_fault() {
+            return Some(fault);
         }
         let ended = self.drops.ended_inputs();
         (!ended.is_empty()).then(|| format!("vehicle {}: {}", self.name, ended.join("; ")))
@@ -325,11 +326,6 @@ impl VehicleStatus {
     pub(crate) fn engine_beats(&self) {
         let ms = u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX);
         self.engine_beat_ms.store(ms.max(1), Ordering::Relaxed);
-    }
-
-    /// Records which listeners hang or have stopped; empty: none.
-    pub(crate) fn set_listener_fault(&self, fault: &str) {
-        fault.clone_into(&mut locked(&self.listener_fault));
     }
 
     /// Records the phase of the replay that makes the maps, and tells readers of its end.

@@ -9,10 +9,12 @@ use object_store::local::LocalFileSystem;
 use object_store::prefix::PrefixStore;
 use object_store::{ClientOptions, ObjectStore, RetryConfig};
 
+use super::paced_http::{PacedConnector, SILENT_MAX};
+use super::rate::UploadRate;
 use crate::base::file_advice::advised;
 
-/// Longest time of one request. Ours: 8 MiB, the size of one piece of a part, at 1 Mbit/s.
-const REQUEST_TIMEOUT: Duration = Duration::from_secs(70);
+/// Longest time of one request without a rate.
+const REQUEST_TIMEOUT: Duration = SILENT_MAX;
 /// Longest time in which a request is repeated. Ours; after it the part waits until the folder is looked at again.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -34,11 +36,24 @@ pub struct OpenError {
 /// [`OpenError`] for another kind of URL, a folder that cannot be created, or variables that contradict each other. A
 /// server that does not answer is no error here.
 pub fn open(url: &str) -> Result<Arc<dyn ObjectStore>, OpenError> {
-    if let Some(folder) = folder(url) {
-        let wrong = |source| OpenError { url: url.to_owned(), reason: advised(folder, source).to_string() };
-        std::fs::create_dir_all(folder).map_err(wrong)?;
-    }
+    create(url)?;
     open_existing(url)
+}
+
+/// As [`open`]; what is sent to a bucket is sent at this rate. A request of it may take as long as it sends something.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_at(url: &str, rate: &UploadRate) -> Result<Arc<dyn ObjectStore>, OpenError> {
+    create(url)?;
+    opened(url, |builder| builder.with_http_connector(PacedConnector(rate.clone())))
+}
+
+/// Creates the folder that a URL names.
+fn create(url: &str) -> Result<(), OpenError> {
+    let Some(folder) = folder(url) else { return Ok(()) };
+    let wrong = |source| OpenError { url: url.to_owned(), reason: advised(folder, source).to_string() };
+    std::fs::create_dir_all(folder).map_err(wrong)
 }
 
 /// The folder that a text names by its path or as `file:///PATH`; `None` for other URLs.
@@ -55,6 +70,13 @@ pub fn folder(url: &str) -> Option<&Path> {
 /// # Errors
 /// As [`open`], and for a folder that does not exist.
 pub fn open_existing(url: &str) -> Result<Arc<dyn ObjectStore>, OpenError> {
+    opened(url, |builder| builder.with_client_options(client_options().with_timeout(REQUEST_TIMEOUT)))
+}
+
+fn opened(
+    url: &str,
+    connect: impl FnOnce(AmazonS3Builder) -> AmazonS3Builder,
+) -> Result<Arc<dyn ObjectStore>, OpenError> {
     let wrong = |reason: String| OpenError { url: url.to_owned(), reason };
     if let Some(folder) = folder(url) {
         if !folder.is_dir() {
@@ -76,10 +98,9 @@ pub fn open_existing(url: &str) -> Result<Arc<dyn ObjectStore>, OpenError> {
     let store = AmazonS3Builder::from_env()
         .with_bucket_name(bucket)
         .with_checksum_algorithm(Checksum::SHA256)
-        .with_client_options(client_options().with_timeout(REQUEST_TIMEOUT))
-        .with_retry(retry)
-        .build()
-        .map_err(|error| wrong(error.to_string()))?;
+        .with_client_options(client_options())
+        .with_retry(retry);
+    let store = connect(store).build().map_err(|error| wrong(error.to_string()))?;
     Ok(match prefix.trim_matches('/') {
         "" => Arc::new(store),
         prefix => Arc::new(PrefixStore::new(store, prefix)),

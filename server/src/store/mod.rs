@@ -4,6 +4,8 @@
 //! |---|---|
 //! | [`location`] | a path or a URL -> the store |
 //! | [`index`] | a finished part -> what it holds, for a search; a search -> the parts |
+//! | [`rate`] | what the link takes for maps -> how fast uploads may be |
+//! | [`paced_http`] | requests to a store -> the same at that rate |
 //! | [`fetch`] | the URL of a recording in a store -> a copy here |
 //! | [`upload`] | finished parts of a folder -> the store, confirmed |
 //!
@@ -13,4 +15,6 @@
 pub mod fetch;
 pub mod index;
 pub mod location;
+pub mod paced_http;
+pub mod rate;
 pub mod upload;

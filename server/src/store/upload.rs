@@ -9,11 +9,11 @@ use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use futures::TryStreamExt;
 use object_store::{ObjectStore, ObjectStoreExt, WriteMultipart, path::Path as Key};
 use serde::{Deserialize, Serialize};
 
 use super::index::Entry;
+use super::rate::UploadRate;
 use crate::record::mcap_reader::McapReadError;
 use crate::record::writer::{confirmation_of, is_being_written};
 
@@ -108,7 +108,7 @@ pub fn reason(error: &object_store::Error) -> String {
 /// # Errors
 /// [`UploadError`]; the part is then not confirmed.
 pub async fn upload(store: &dyn ObjectStore, finished_part: &Path) -> Result<Confirmation, UploadError> {
-    upload_prepared(store, finished_part, &prepare(finished_part)?).await
+    upload_prepared(store, finished_part, &prepare(finished_part)?, &UploadRate::unlimited()).await
 }
 
 /// Reads a finished part for [`upload_prepared`].
@@ -124,7 +124,7 @@ pub fn prepare(file: &Path) -> Result<Prepared, UploadError> {
     Ok(Prepared { bytes, crc32, entries })
 }
 
-/// As [`upload`], for a part that was prepared and has not changed since.
+/// As [`upload`], for a part that was prepared and has not changed since, and is read back at this rate.
 ///
 /// # Errors
 /// As [`upload`].
@@ -132,6 +132,7 @@ pub async fn upload_prepared(
     store: &dyn ObjectStore,
     file: &Path,
     prepared: &Prepared,
+    rate: &UploadRate,
 ) -> Result<Confirmation, UploadError> {
     let read = |source| UploadError::Read { file: file.to_owned(), source };
     let refused = |source| UploadError::Store { file: file.to_owned(), source };
@@ -139,7 +140,7 @@ pub async fn upload_prepared(
     let (bytes, crc32, part) = (*bytes, *crc32, entries[0].part.clone());
     let key = Key::from(part.as_str());
     send(store, &key, file).await?;
-    let found = crc_in_store(store, &key).await.map_err(refused)?;
+    let found = crc_in_store(store, &key, rate).await.map_err(refused)?;
     if found != (bytes, crc32) {
         return Err(UploadError::Differs { file: file.to_owned(), part, sent: crc32, found: found.1 });
     }
@@ -226,12 +227,16 @@ async fn send(store: &dyn ObjectStore, key: &Key, file: &Path) -> Result<(), Upl
     pieces.finish().await.map(drop).map_err(refused)
 }
 
-async fn crc_in_store(store: &dyn ObjectStore, key: &Key) -> object_store::Result<(u64, u32)> {
-    let mut content = store.get(key).await?.into_stream();
-    let (mut length, mut crc) = (0, crc32fast::Hasher::new());
-    while let Some(bytes) = content.try_next().await? {
-        length += bytes.len() as u64;
-        crc.update(&bytes);
+/// The length and the CRC-32 of an object. It is read in ranges, because what the store has begun to send cannot be
+/// held back.
+async fn crc_in_store(store: &dyn ObjectStore, key: &Key, rate: &UploadRate) -> object_store::Result<(u64, u32)> {
+    let length = store.head(key).await?.size;
+    let (mut read, mut crc) = (0, crc32fast::Hasher::new());
+    while read < length {
+        let range = read..length.min(read + rate.answer_bytes() as u64);
+        rate.take((range.end - range.start) as usize).await;
+        read = range.end;
+        crc.update(&store.get_range(key, range).await?);
     }
     Ok((length, crc.finalize()))
 }

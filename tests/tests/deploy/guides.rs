@@ -47,6 +47,9 @@ const SENSOR: &str = "clearway simulate flat --sensor vlp16 --seconds 600 --to u
     --telemetry-to udp://127.0.0.1:8308 2>simulate.log &
 ";
 
+/// The certificates of a reader.
+const TLS: &str = "--ca certificates/ca.pem --cert certificates/reader.pem --key certificates/reader.key";
+
 /// Runs a script in a network namespace and in this folder.
 fn follow(folder: &Path, script: &str) -> String {
     symlink(workspace().join("deploy"), folder.join("deploy")).expect("a link of ours");
@@ -101,7 +104,7 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
     let python = venv::client(&workspace());
     for (language, block) in &blocks {
         match (language.as_str(), block.split_whitespace().next()) {
-            ("toml", _) => fs::write(folder.path().join("vehicle.toml"), block).expect("a file of ours"),
+            ("toml", _) => fs::write(folder.path().join("fleet.toml"), block).expect("a file of ours"),
             ("python", _) => {
                 fs::write(folder.path().join("planner.py"), block).expect("a file of ours");
                 _ = writeln!(script, "{} planner.py", python.display());
@@ -110,9 +113,18 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
                 let port = "bash -c '</dev/tcp/localhost/7447'";
                 _ = writeln!(script, "{} 2>router.log &\nwait_until $! {port}", block.trim());
             }
+            _ if block.contains("--vehicle van") => {
+                // The second vehicle is on this host too, so it has ports of its own, and no sensor.
+                let ports =
+                    ["grpc.listen=127.0.0.1:50052", "page.listen=127.0.0.1:8081", "vehicle.udp.data=127.0.0.1:0"];
+                let ports =
+                    ports.iter().chain(&["vehicle.udp.telemetry=127.0.0.1:0"]).map(|set| format!(" --set {set}"));
+                _ = writeln!(script, "{}{} 2>van.log &", block.trim(), ports.collect::<String>());
+                let listed = format!("bash -c 'clearway vehicles --json {TLS} | grep \\\"van\\\"'");
+                _ = writeln!(script, "wait_until $! {listed}");
+            }
             _ if block.starts_with("clearway serve") => {
-                let tls = "--ca certificates/ca.pem --cert certificates/reader.pem --key certificates/reader.key";
-                _ = writeln!(script, "{} 2>serve.log &\nwait_until $! clearway vehicles {tls}", block.trim());
+                _ = writeln!(script, "{} 2>serve.log &\nwait_until $! clearway vehicles {TLS}", block.trim());
                 // The vehicle listens nowhere that others could reach; the router does.
                 script += "ss --no-header --listening --tcp --udp --numeric --processes | grep \"pid=$pid,\" | tee listening\n";
                 script += "if grep -v ' 127.0.0.1:' listening; then exit 1; fi\n";
@@ -123,6 +135,8 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
     }
     let printed = follow(folder.path(), &script);
     assert!(printed.lines().any(|line| line.ends_with(" False")), "a fresh map: {printed}");
+    let listed = |name: &str| printed.lines().any(|line| line.split_whitespace().next() == Some(name));
+    assert!(listed("car") && listed("van"), "any server lists all vehicles: {printed}");
 }
 
 #[test]

@@ -21,6 +21,7 @@ const HEAD: &str = "# Every value that this configuration has. A comment says wh
 #[command(after_help = "Examples:
   clearway check --default > clearway.toml
   clearway check --config clearway.toml
+  clearway check --config fleet.toml --vehicle car3
   clearway check --set grpc.listen=0.0.0.0:50051")]
 pub struct Options {
     /// Print the default configuration, in which every key and every optional table is explained.
@@ -43,6 +44,7 @@ pub fn run(options: &Options) -> Result<()> {
     let config = configuration.load()?;
     config.calibrations(&configuration.config)?;
     config.certificates(&configuration.config)?;
-    print(&format!("{HEAD}{}", Config::explain(&configuration.config, &configuration.overrides())?))?;
+    let ConfigurationOptions { config: file, vehicles, .. } = configuration;
+    print(&format!("{HEAD}{}", Config::explain(file, &configuration.overrides(), vehicles)?))?;
     Ok(())
 }

@@ -34,14 +34,37 @@ impl ServerOptions {
     /// # Errors
     /// If a PEM file cannot be read, and as [`Client::connect`].
     pub async fn connect(&self) -> Result<Client> {
+        match self.tls()? {
+            None => Client::connect(&self.address).await.map_err(explain),
+            Some(tls) => Client::connect_tls(&self.address, &tls).await.map_err(explain),
+        }
+    }
+
+    /// Connects to a router or server over zenoh, with certificates if `--ca` is given.
+    ///
+    /// # Errors
+    /// If a PEM file cannot be read, and as [`ZenohClient::connect`](clearway_client::ZenohClient::connect).
+    #[cfg(feature = "zenoh")]
+    pub async fn connect_over_zenoh(&self, endpoint: &str) -> Result<clearway_client::ZenohClient> {
+        let connected = match self.tls()? {
+            None => clearway_client::ZenohClient::connect(endpoint).await,
+            Some(tls) => clearway_client::ZenohClient::connect_tls(endpoint, &tls).await,
+        };
+        let advice = |error: ClientError| match endpoint.contains("tls/") && self.cert.is_none() {
+            true => Error::from(error).context("a router of a fleet requires a certificate: --ca, --cert and --key"),
+            false => Error::from(error),
+        };
+        connected.map_err(advice)
+    }
+
+    fn tls(&self) -> Result<Option<Tls>> {
         let read = |file: &PathBuf| files::read_text(file);
-        let Some(ca) = &self.ca else { return Client::connect(&self.address).await.map_err(explain) };
+        let Some(ca) = &self.ca else { return Ok(None) };
         let identity = match (&self.cert, &self.key) {
             (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
             _ => None,
         };
-        let tls = Tls { ca: read(ca)?, identity, server_name: String::new() };
-        Client::connect_tls(&self.address, &tls).await.map_err(explain)
+        Ok(Some(Tls { ca: read(ca)?, identity, server_name: String::new() }))
     }
 }
 

@@ -39,8 +39,9 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
-    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
+    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447; or, with --ca, --cert and --key,
+    /// tls/HOST:7447.
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
     #[arg(long, value_name = "FILE.pub", requires = "zenoh")]
@@ -237,7 +238,7 @@ async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapSt
         [layer] => layer,
         several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
     };
-    let mut client = clearway_client::ZenohClient::connect(endpoint).await?;
+    let mut client = options.server.connect_over_zenoh(endpoint).await?;
     if let Some(file) = &options.signed_by {
         client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
     }

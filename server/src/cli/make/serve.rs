@@ -18,6 +18,7 @@ use crate::server::{Running, Server, Setup, ShutdownError};
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway serve
+  clearway serve --config fleet.toml --vehicle car3
   clearway serve --config car.toml --set grpc.listen=0.0.0.0:50051 --set recorder.file=drive.mcap")]
 pub struct Options {
     #[command(flatten)]

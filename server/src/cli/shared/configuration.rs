@@ -19,6 +19,10 @@ pub struct ConfigurationOptions {
     /// precedence.
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
+    /// Use this vehicle of the file alone; several are separated by commas. On a vehicle, with one file for the whole
+    /// fleet; all by default.
+    #[arg(long = "vehicle", value_name = "NAME", env = "CLEARWAY_VEHICLE", value_delimiter = ',')]
+    pub vehicles: Vec<String>,
 }
 
 impl ConfigurationOptions {
@@ -28,7 +32,7 @@ impl ConfigurationOptions {
     /// # Errors
     /// [`ConfigError`].
     pub fn load(&self) -> Result<Config, ConfigError> {
-        let config = Config::load(&self.config, &self.overrides())?;
+        let config = Config::load_vehicles(&self.config, &self.overrides(), &self.vehicles)?;
         config.check_exposure(&Origin::file(&self.config))?;
         Ok(config)
     }

@@ -22,6 +22,9 @@ pub struct Tls {
     pub web: TlsAcceptor,
     /// The names in the server's certificate.
     pub names: Vec<String>,
+    /// When the server's certificates and those of the CA end, by their keys in the configuration, in seconds since the
+    /// Unix epoch.
+    pub ends_s: Vec<(&'static str, i64)>,
 }
 
 impl Tls {
@@ -34,6 +37,7 @@ impl Tls {
         let chain = parse_chain("certificate", certificate)?;
         let key = PrivateKeyDer::from_pem_slice(key.as_bytes()).map_err(|error| format!("key: {error}"))?;
         let names = chain.first().map(|own| names(own)).unwrap_or_default();
+        let mut ends_s: Vec<_> = end_s(&chain).map(|end_s| ("grpc.tls.certificate", end_s)).into_iter().collect();
         let acceptor = |protocol: &str, is_required: bool| {
             let provider = Arc::new(default_provider());
             let builder = ServerConfig::builder_with_provider(provider.clone());
@@ -55,7 +59,11 @@ impl Tls {
             config.alpn_protocols = vec![protocol.into()];
             Ok::<_, String>(TlsAcceptor::from(Arc::new(config)))
         };
-        Ok(Self { grpc: acceptor("h2", true)?, web: acceptor("http/1.1", false)?, names })
+        let (grpc, web) = (acceptor("h2", true)?, acceptor("http/1.1", false)?);
+        if let Some(client_ca) = client_ca {
+            ends_s.extend(end_s(&parse_chain("client_ca", client_ca)?).map(|end_s| ("grpc.tls.client_ca", end_s)));
+        }
+        Ok(Self { grpc, web, names, ends_s })
     }
 }
 
@@ -66,6 +74,12 @@ fn parse_chain(what: &str, pem: &str) -> Result<Vec<CertificateDer<'static>>, St
         Ok(_) => Err(format!("{what}: no certificate")),
         Err(error) => Err(format!("{what}: {error}")),
     }
+}
+
+/// The earliest end of these certificates, in seconds since the Unix epoch; `None` if none of them parses.
+fn end_s(chain: &[CertificateDer<'_>]) -> Option<i64> {
+    let end = |der: &CertificateDer<'_>| Some(X509Certificate::from_der(der).ok()?.1.validity().not_after.timestamp());
+    chain.iter().filter_map(end).min()
 }
 
 /// The names in a certificate: common name and DNS names. A certificate that does not parse has none, and so no role.

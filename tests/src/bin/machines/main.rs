@@ -23,7 +23,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use clearway_tests::machines::{Machines, ROUTERS};
+use clearway_tests::machines::{Machines, ROUTERS, namespace};
 use clearway_tests::roles::{Process, Role, name, server_config};
 
 /// Faults between machines.
@@ -314,7 +314,8 @@ fn faults() -> Vec<Fault> {
             of[2],
             |bed| bed.machines.stop(&["s3 server"]),
             |bed| {
-                let arguments = ["-n", "s3", "address", "delete", "10.99.0.13/24", "dev", "wire"];
+                let s3 = namespace("s3");
+                let arguments = ["-n", &s3, "address", "delete", "10.99.0.13/24", "dev", "wire"];
                 assert!(Command::new("ip").args(arguments).status().expect("ip runs").success());
                 bed.start_server("s3", "", &bed.vehicles[2].clone());
             },

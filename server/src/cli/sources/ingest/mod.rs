@@ -32,8 +32,9 @@ pub struct Options {
     files: FileOptions,
     #[command(flatten)]
     server: ServerOptions,
-    /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
+    /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447; or, with --ca, --cert and --key,
+    /// tls/HOST:7447.
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// The vehicle; needed over zenoh, and if the server has several.
     #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
@@ -65,7 +66,7 @@ async fn ingest(options: &Options) -> Result<()> {
         return Err(usage_error("--sensor is for scans and drives, and the files have neither"));
     }
     let ingester = match &options.zenoh {
-        Some(endpoint) => ingest_over_zenoh(endpoint, &options.vehicle).await?,
+        Some(endpoint) => ingest_over_zenoh(endpoint, options).await?,
         None => options.server.connect().await?.ingest(&options.vehicle).await.map_err(explain)?,
     };
     let mut sender =
@@ -86,12 +87,12 @@ async fn ingest(options: &Options) -> Result<()> {
 }
 
 #[cfg(feature = "zenoh")]
-async fn ingest_over_zenoh(endpoint: &str, vehicle: &str) -> Result<Ingester> {
-    Ok(clearway_client::ZenohClient::connect(endpoint).await?.ingest(vehicle).await?)
+async fn ingest_over_zenoh(endpoint: &str, options: &Options) -> Result<Ingester> {
+    Ok(options.server.connect_over_zenoh(endpoint).await?.ingest(&options.vehicle).await?)
 }
 
 #[cfg(not(feature = "zenoh"))]
-async fn ingest_over_zenoh(endpoint: &str, _: &str) -> Result<Ingester> {
+async fn ingest_over_zenoh(endpoint: &str, _: &Options) -> Result<Ingester> {
     bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
 }
 
