@@ -8,10 +8,12 @@
 //! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`subscriptions`] | readers -> layers to compute |
 //! | [`acknowledgements`] | readers that acknowledge -> the maps that they have finished with |
+//! | [`turns`] | engines with events -> those that work at once |
 
 pub mod acknowledgements;
 pub mod newest;
 pub mod subscriptions;
+pub mod turns;
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
@@ -28,6 +30,7 @@ use tokio::sync::watch;
 use crate::base::clock::now_ns;
 use crate::encode::{self, EncodedMap, Replayed};
 use crate::engine::newest::Newest;
+use crate::engine::turns::{Turn, Turns};
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::receipt::Outcome;
 use crate::record::writer::RecordingHandle;
@@ -59,11 +62,11 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// Starts the thread. It ends when the vehicle's queue is closed and empty.
+    /// Starts the thread, which works in `turns`. It ends when the vehicle's queue is closed and empty.
     ///
     /// # Errors
     /// [`std::io::Error`] if the system cannot create a thread.
-    pub fn start(mut self, events: Receiver<QueuedEvent>) -> std::io::Result<JoinHandle<()>> {
+    pub fn start(mut self, events: Receiver<QueuedEvent>, turns: Arc<Turns>) -> std::io::Result<JoinHandle<()>> {
         std::thread::Builder::new().name(format!("engine {}", self.status.name)).spawn(move || {
             // Marks the engine as stopped also if the thread panics.
             struct Stopped(Arc<VehicleStatus>);
@@ -74,9 +77,13 @@ impl Engine {
             }
             let _stopped = Stopped(self.status.clone());
             self.status.engine_beats();
-            while let Some(queued) = self.next(&events) {
+            let mut turn = None;
+            while let Some(queued) = self.next(&events, &mut turn) {
                 self.status.engine_beats();
+                turn = turn.or_else(|| Some(turns.wait()));
+                let maps = self.maps();
                 self.step(queued);
+                turn = turn.filter(|_| self.maps() == maps);
             }
         })
     }
@@ -121,12 +128,14 @@ impl Engine {
         self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors(), pose);
     }
 
-    /// Waits for the next event; `None` once the queue is closed and empty. Updates the status before it waits.
-    fn next(&mut self, events: &Receiver<QueuedEvent>) -> Option<QueuedEvent> {
+    /// Waits for the next event; `None` once the queue is closed and empty. Updates the status and ends the turn before
+    /// it waits.
+    fn next(&mut self, events: &Receiver<QueuedEvent>, turn: &mut Option<Turn<'_>>) -> Option<QueuedEvent> {
         match events.try_recv() {
             Ok(queued) => return Some(queued),
             Err(TryRecvError::Empty | TryRecvError::Disconnected) => self.update_status(),
         }
+        *turn = None;
         loop {
             match events.recv_timeout(POLL_INTERVAL) {
                 Ok(queued) => return Some(queued),

@@ -28,6 +28,7 @@ use crate::base::held_sockets::HeldSockets;
 #[cfg(feature = "zenoh")]
 use crate::config::ZenohMode;
 use crate::config::{self, Certificates, Config, Vehicle, listeners};
+use crate::engine::turns::Turns;
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
@@ -258,6 +259,7 @@ impl Running {
             }
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
+        let turns = Arc::new(Turns::of_processors());
         for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
             if driver.from_files {
@@ -273,7 +275,8 @@ impl Running {
                 continue;
             }
             let name = status.name.clone();
-            let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
+            let thread = engine.start(events, turns.clone());
+            let thread = thread.map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
             self.engines.push((name, thread));
         }
         Ok(())
