@@ -311,7 +311,7 @@ async fn readers_with_the_public_key_believe_the_server_that_signs() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn what_a_peer_publishes_on_a_wildcard_over_the_servers_keys_reaches_nobody() {
+async fn what_a_peer_publishes_on_a_wildcard_over_the_servers_keys_reaches_no_subscriber() {
     let mut config = config();
     config.zenoh.enabled = true;
     let running = fixture::start(config).await;

@@ -8,6 +8,7 @@
 //! messages, and one that receives nothing for [`SEND_TIMEOUT`] is disconnected.
 
 use std::collections::BTreeMap;
+use std::ops::Bound;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -359,9 +360,14 @@ impl Client {
                 },
             };
             let status = answer.map(|text| json!({ "op": "status", "level": 2, "message": text }));
-            let status = status.map(|status| WsMessage::Text(status.to_string().into()));
-            let frames: Vec<_> = status.into_iter().chain(self.due()).collect();
-            for frame in frames {
+            if let Some(status) = status
+                && !send(&mut socket, WsMessage::Text(status.to_string().into())).await
+            {
+                return;
+            }
+            let mut last = None;
+            while let Some((id, frame)) = next_due(&mut self.subscriptions, last) {
+                last = Some(id);
                 if !send(&mut socket, frame).await {
                     return;
                 }
@@ -408,28 +414,58 @@ impl Client {
         }
         Ok(())
     }
+}
 
-    /// The new messages of all subscriptions.
-    fn due(&mut self) -> Vec<WsMessage> {
-        let changed = self.subscriptions.iter_mut().filter(|(_, of)| of.newest.has_changed().unwrap_or(false));
-        let due = changed.filter_map(|(&id, of)| {
-            let message = of.newest.borrow_and_update().clone()?;
-            // Points and poses are not in every map.
-            if of.layer.is_some() {
-                of.reader.got(0, message.sequence);
-            }
-            let mut frame = BytesMut::with_capacity(13 + message.data.len());
-            frame.put_u8(1);
-            frame.put_u32_le(id);
-            frame.put_u64_le(message.log_ns);
-            frame.extend_from_slice(&message.data);
-            Some(WsMessage::Binary(frame.freeze()))
-        });
-        due.collect()
-    }
+/// The first subscription after `last` (all, if there is none) that has a new message, and its frame. Frames are made
+/// one at a time: those of a client that does not read, and has many subscriptions, would be many times the message.
+fn next_due(subscriptions: &mut BTreeMap<u32, Subscription>, last: Option<u32>) -> Option<(u32, WsMessage)> {
+    let after = (last.map_or(Bound::Unbounded, Bound::Excluded), Bound::Unbounded);
+    let mut changed = subscriptions.range_mut(after).filter(|(_, of)| of.newest.has_changed().unwrap_or(false));
+    changed.find_map(|(&id, of)| {
+        let message = of.newest.borrow_and_update().clone()?;
+        // Points and poses are not in every map.
+        if of.layer.is_some() {
+            of.reader.got(0, message.sequence);
+        }
+        let mut frame = BytesMut::with_capacity(13 + message.data.len());
+        frame.put_u8(1);
+        frame.put_u32_le(id);
+        frame.put_u64_le(message.log_ns);
+        frame.extend_from_slice(&message.data);
+        Some((id, WsMessage::Binary(frame.freeze())))
+    })
 }
 
 /// `false` if the client is gone, or does not receive.
 async fn send(socket: &mut WebSocket, frame: WsMessage) -> bool {
     matches!(tokio::time::timeout(SEND_TIMEOUT, socket.send(frame)).await, Ok(Ok(())))
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Buf;
+
+    use super::*;
+
+    #[test]
+    fn the_frame_of_a_subscription_is_made_when_the_one_before_it_was_sent() {
+        let message = |sequence| Some(Message { sequence, log_ns: sequence, data: Bytes::from_static(b"points") });
+        let channel = watch::Sender::new(message(1));
+        let readers = Arc::default();
+        let mut subscriptions: BTreeMap<_, _> = (5..=7)
+            .map(|id| {
+                let mut newest = channel.subscribe();
+                newest.mark_changed();
+                (id, Subscription { newest, layer: None, reader: Reader::new(&readers, Transport::Foxglove) })
+            })
+            .collect();
+        let mut next = |last| {
+            let (id, frame) = next_due(&mut subscriptions, last)?;
+            Some((id, frame.into_data().slice(5..13).get_u64_le()))
+        };
+        assert_eq!(next(None), Some((5, 1)));
+        channel.send_replace(message(2));
+        assert_eq!([next(Some(5)), next(Some(6)), next(Some(7))], [Some((6, 2)), Some((7, 2)), None]);
+        assert_eq!([next(None), next(Some(5))], [Some((5, 2)), None]);
+    }
 }

@@ -61,8 +61,8 @@ pub(super) const MESSAGE_BYTES_MAX: usize = 4096;
 const WATCHES_MAX: usize = 64;
 /// Most acknowledgements that wait for one vehicle; more are a fault of the browser.
 const REQUESTS_MAX: usize = 64;
-/// Most frames of a browser at once, and how many more each second. Ours: an acknowledgement for each map of each vehicle
-/// at twice the rate at which a screen could show them.
+/// Most frames of a browser at once, and how many more each second. Ours: 64 vehicles with ten maps a second need 640
+/// acknowledgements a second.
 const FRAMES_MAX: u32 = 4000;
 const FRAMES_PER_SECOND: u32 = 2000;
 /// Shortest time between two statuses that are sent at once because another vehicle's is wanted. Ours.

@@ -85,15 +85,16 @@ fn target() -> Target {
     let any = (Ipv4Addr::LOCALHOST, 0);
     let tcp = || TcpListener::bind(any).and_then(|listener| listener.local_addr()).expect("a free port");
     let udp = UdpSocket::bind(any).and_then(|socket| socket.local_addr()).expect("a free port");
-    Target { grpc: tcp(), page: tcp(), udp, zenoh: format!("tcp/{}", tcp()) }
+    Target { grpc: tcp(), page: tcp(), foxglove: tcp(), udp, zenoh: format!("tcp/{}", tcp()) }
 }
 
 /// Starts the server with the default configuration, and the sensor's sender known.
 fn start(server: &PathBuf, config: PathBuf, target: &Target) -> Child {
-    let Target { grpc, page, udp, zenoh } = target;
+    let Target { grpc, page, foxglove, udp, zenoh } = target;
     let telemetry = SocketAddr::new(udp.ip(), 0);
     let text = format!(
-        "[grpc]\nlisten = \"{grpc}\"\n[page]\nlisten = \"{page}\"\n[zenoh]\nlisten = [\"{zenoh}\"]\n\
+        "[grpc]\nlisten = \"{grpc}\"\n[page]\nlisten = \"{page}\"\n[foxglove]\nenabled = true\n\
+         listen = \"{foxglove}\"\n[zenoh]\nlisten = [\"{zenoh}\"]\n\
          [[vehicle]]\nname = \"car\"\n[vehicle.udp]\ndata = \"{udp}\"\ntelemetry = \"{telemetry}\"\n\
          [vehicle.udp.from]\ntop = \"127.0.0.1\"\n[[vehicle.sensor]]\nname = \"top\"\n\
          [vehicle.sensor.extrinsics]\nx_m = 0.0\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n"

@@ -1,5 +1,5 @@
-//! What no browser sends to the page: frames of a WebSocket without pause, frames that are too long, requests without
-//! pause.
+//! What no browser sends to the page or Foxglove's WebSocket: frames without pause, frames that are too long, requests
+//! without pause, many subscriptions that are never read.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -14,12 +14,22 @@ use super::target::{Attack, connect};
 const AGAIN: Duration = Duration::from_millis(20);
 const UPGRADE: &[u8] = b"GET /live HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
     Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+const FOXGLOVE: &[u8] = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+    Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\
+    Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+/// Channels of one vehicle, and subscriptions of one client, of which 256 are allowed.
+const CHANNELS: u32 = 10;
+const SUBSCRIPTIONS: u32 = 256;
 const SELECTION: &str = r#"{"type":"watch","vehicle":"car","layers":["speed"]}"#;
 
 /// The attacks of this file.
 pub const ATTACKS: &[Attack] = &[
     Attack { name: "page: flood of WebSocket pings", run: |target| flood(target.page, UPGRADE, pings()).boxed() },
     Attack { name: "page: flood of selections", run: |target| flood(target.page, UPGRADE, selections()).boxed() },
+    Attack {
+        name: "Foxglove: 5,120 subscriptions that never read",
+        run: |target| subscriptions(target.foxglove).boxed(),
+    },
     Attack { name: "page: WebSocket frames of 15 MiB", run: |target| long_frames(target.page).boxed() },
     Attack {
         name: "page: flood of requests for the metrics",
@@ -79,4 +89,25 @@ async fn long_frames(at: SocketAddr) {
         }
     };
     futures::future::join_all((0..64).map(send)).await;
+}
+
+/// Subscribes 20 clients as often as each may, to all channels, and reads nothing.
+async fn subscriptions(at: SocketAddr) {
+    let wanted = (0..SUBSCRIPTIONS).flat_map(|id| {
+        let channel = id % CHANNELS + 1;
+        let wanted = format!(r#"{{"op":"subscribe","subscriptions":[{{"id":{id},"channelId":{channel}}}]}}"#);
+        frame(1, wanted.as_bytes())
+    });
+    let bytes = [FOXGLOVE, &wanted.collect::<Vec<_>>()].concat();
+    let hold = |_| async {
+        loop {
+            if let Ok(mut socket) = connect(at).await
+                && socket.write_all(&bytes).await.is_ok()
+            {
+                let _cut = socket.ready(tokio::io::Interest::ERROR).await;
+            }
+            tokio::time::sleep(AGAIN).await;
+        }
+    };
+    futures::future::join_all((0..20).map(hold)).await;
 }

@@ -169,7 +169,7 @@ fn answers(_: u32) -> Vec<u8> {
     frame(kind::PING, flag::ACK, 0, &[0; 8]).repeat(100)
 }
 
-/// Frames of a type that nobody knows.
+/// Frames of an unknown type.
 fn unknown(_: u32) -> Vec<u8> {
     frame(77, 0, 0, &[0; 8]).repeat(100)
 }

@@ -15,6 +15,8 @@ pub struct Target {
     pub grpc: SocketAddr,
     /// The page.
     pub page: SocketAddr,
+    /// Foxglove's WebSocket.
+    pub foxglove: SocketAddr,
     /// Datagrams of the sensor.
     pub udp: SocketAddr,
     /// zenoh, such as `tcp/127.0.0.1:7447`.

@@ -34,7 +34,7 @@ async fn frames_without_data_end_their_connection_and_no_other() {
     let first = tokio_stream::once(fixture::selection("car", &[], 0));
     let mut maps = healthy.watch(first).await.unwrap().into_inner();
     let address = running.grpc.unwrap();
-    // PRIORITY of a stream that never was, SETTINGS, PING, its answer, WINDOW_UPDATE, and a type that nobody knows.
+    // PRIORITY of a stream that never was, SETTINGS, PING, its answer, WINDOW_UPDATE, and an unknown type.
     let kinds = [(2, 0, 9, 5), (4, 0, 0, 0), (6, 0, 0, 8), (6, 1, 0, 8), (8, 0, 0, 4), (77, 0, 0, 100)];
     for (kind, flags, stream, length) in kinds {
         let mut payload = vec![0; length];
