@@ -60,8 +60,7 @@ impl Flood {
             words.for_each(|((passable, reached), stage)| *passable &= reached | !stage);
         }
         reached.flood(passable);
-        covered.clear();
-        covered.dilate(reached, radius);
+        covered.cover(reached, closed, radius);
         self.narrow(open, closed, radius, &stages.border);
     }
 
@@ -80,8 +79,7 @@ impl Flood {
                 let words = middles.words.iter_mut().zip(&near.words).zip(&passable.words).zip(&border.words);
                 words.for_each(|(((middle, before), passable), border)| *middle &= passable & (before | !border));
             }
-            near.clear();
-            near.dilate(middles, radius);
+            near.cover(middles, closed, radius);
             covered.words.iter_mut().zip(&near.words).for_each(|(covered, near)| *covered &= near);
         }
     }
@@ -191,6 +189,16 @@ impl Bits {
                 each(at % self.stride * 64 + rest.trailing_zeros() as usize, at / self.stride);
                 rest &= rest - 1;
             }
+        }
+    }
+
+    /// Replaces the bits by the cells that a disc covers with its middle on these cells. A disc of one cell also covers
+    /// the cells at its sides, unless they are closed: a vehicle is wider than its disc.
+    fn cover(&mut self, middles: &Self, closed: &Self, radius: usize) {
+        self.clear();
+        self.dilate(middles, radius.max(1));
+        if radius == 0 {
+            self.words.iter_mut().zip(&closed.words).for_each(|(covered, closed)| *covered &= !closed);
         }
     }
 
