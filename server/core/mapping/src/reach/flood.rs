@@ -130,13 +130,15 @@ pub struct Bits {
     /// Number of words in a row.
     stride: usize,
     words: Vec<u64>,
+    /// A row, for [`Bits::dilate`].
+    wide: Vec<u64>,
 }
 
 impl Bits {
     /// `width` × `width` bits that are not set.
     pub fn square(width: usize) -> Self {
         let stride = width.div_ceil(64);
-        Self { width, stride, words: vec![0; stride * width] }
+        Self { width, stride, words: vec![0; stride * width], wide: vec![0; stride] }
     }
 
     /// Clears all bits.
@@ -206,7 +208,7 @@ impl Bits {
     fn dilate(&mut self, from: &Self, radius: usize) {
         let rows = from.words.len() / from.stride;
         let half_width = |dy: usize| (radius * radius - dy * dy).isqrt();
-        let mut wide = vec![0; from.stride];
+        let mut wide = std::mem::take(&mut self.wide);
         for (iy, row) in from.words.chunks_exact(from.stride).enumerate() {
             if row.iter().all(|word| *word == 0) {
                 continue;
@@ -223,6 +225,7 @@ impl Bits {
                 dilate_by_one(&mut wide);
             }
         }
+        self.wide = wide;
     }
 
     /// Spreads set bits to neighbours along sides of cells as long as they are set in `open`.

@@ -3,7 +3,8 @@
 //! In: lowest returns from the ground by cell, millimetres. Out: the cells with a return that lies lower than ground on
 //! two opposite sides of it. The near side of a ditch is hidden, and far from the vehicle the returns from its far side
 //! lie metres from those before it, so that no two cells beside each other show a step. On a grade one side is higher
-//! and the other lower. The foot of a step that is as high counts too. Cells are compared in a grid of half their resolution.
+//! and the other lower. The foot of a step that is as high counts too. Cells are compared in a grid of half their
+//! resolution.
 
 use super::cells::SIDE;
 
@@ -111,13 +112,15 @@ impl Troughs {
     }
 }
 
-/// Writes by cell the greatest height of `length` cells, 3 or 4, from it on, `stride` apart; those past the end are
-/// left out.
+/// Writes by cell the greatest height of `length` cells, 3 or 4, from it on, `stride` apart. The last cells, from which
+/// they do not fit in, get no height.
 fn greatest(of: &[i16], into: &mut [i16], stride: usize, length: usize) {
-    let after = |cells: usize| of[(cells * stride).min(of.len())..].iter().chain(std::iter::repeat(&NONE));
-    let far = after(length - 1);
-    let heights = of.iter().zip(after(1)).zip(after(2)).zip(far);
-    into.iter_mut().zip(heights).for_each(|(into, (((a, b), c), d))| *into = (*a).max(*b).max(*c).max(*d));
+    let whole = of.len() - (length - 1) * stride;
+    let from = |cells: usize| &of[cells * stride..][..whole];
+    let (into, rest) = into.split_at_mut(whole);
+    let heights = from(0).iter().zip(from(1)).zip(from(2)).zip(from(length - 1));
+    into.iter_mut().zip(heights).for_each(|(into, (((a, b), c), d))| *into = (*a).max(*b).max((*c).max(*d)));
+    rest.fill(NONE);
 }
 
 #[cfg(test)]
