@@ -65,8 +65,8 @@ pub(super) fn rate(options: &Store, vehicles: &Vehicles, valid: Vec<Duration>) -
     UploadRate::new(options.upload_kbit_s_max, Arc::new(share))
 }
 
-/// Sends each finished part to the store, at this rate, until the task is aborted. What the store does not confirm stays, and is sent
-/// again. With `delete`, what it confirms is deleted once it is older than `saved`.
+/// Sends each finished part to the store, at this rate, until the task is aborted. What the store does not confirm
+/// stays, and is sent again. With `delete`, what it confirms is deleted once it is older than `saved`.
 pub(super) async fn upload_finished(
     (options, rate): (Store, UploadRate),
     saved: Duration,
