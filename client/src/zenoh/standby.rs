@@ -95,9 +95,8 @@ impl Standby {
             let quiet = if newest.count == 0 { began.elapsed() } else { newest.at.elapsed() };
             let Some(left) = VAIN_AFTER.checked_sub(quiet) else { return Ok(false) };
             // An error means that the first subscription has ended, and this stream with it.
-            match tokio::time::timeout(left, first.wait_for(|arrivals| arrivals.count >= back)).await {
-                Ok(_) => return Ok(true),
-                Err(_) => {}
+            if tokio::time::timeout(left, first.wait_for(|arrivals| arrivals.count >= back)).await.is_ok() {
+                return Ok(true);
             }
         }
     }
