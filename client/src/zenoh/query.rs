@@ -18,7 +18,11 @@ pub(super) const QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 /// Makes the error of a failed operation.
 pub(super) fn failed(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> ClientError {
     let what = what.into();
-    |reason| ClientError::Zenoh { what, reason: reason.to_string() }
+    |reason| {
+        // Without the line of zenoh's sources that made the error.
+        let reason = reason.to_string();
+        ClientError::Zenoh { what, reason: reason.split(" at /").next().unwrap_or(&reason).trim_end().to_owned() }
+    }
 }
 
 /// The key of one layer of one vehicle, and the server that publishes it.

@@ -1,8 +1,9 @@
 //! A second session of a reader that knows several routers, to another router than its first session, while the first
 //! brings no maps.
 //!
-//! A zenoh session has one router. If the link between that router and the one of a vehicle's server is cut, the session
-//! is whole and its maps stop. Then a stream subscribes through another router too, until the first brings maps again.
+//! A zenoh session has one router. If the link between that router and the one of a vehicle's server is cut, the
+//! session is whole and its maps stop. Then a stream subscribes through another router too, until the first brings maps
+//! again.
 //! A session to both routers at all times would cost both of them every map.
 
 use std::sync::{Arc, Weak};
@@ -18,8 +19,8 @@ use crate::error::ClientError;
 use crate::stream::LatestSlot;
 use crate::zenoh::query::{LayerKey, failed};
 
-/// Time without a map, in periods of the maps and at least, after which another router is tried. Ours: the newest map is
-/// then still valid, and most late maps come before.
+/// Time without a map, in periods of the maps and at least, after which another router is tried. Ours: the newest map
+/// is then still valid, and most late maps come before.
 const SILENT_PERIODS: f64 = 1.6;
 const SILENT_MIN: Duration = Duration::from_millis(160);
 /// Longest such time, and that before the first map: the default validity.
@@ -94,9 +95,8 @@ impl Standby {
             let quiet = if newest.count == 0 { began.elapsed() } else { newest.at.elapsed() };
             let Some(left) = VAIN_AFTER.checked_sub(quiet) else { return Ok(false) };
             // An error means that the first subscription has ended, and this stream with it.
-            match tokio::time::timeout(left, first.wait_for(|arrivals| arrivals.count >= back)).await {
-                Ok(_) => return Ok(true),
-                Err(_) => {}
+            if tokio::time::timeout(left, first.wait_for(|arrivals| arrivals.count >= back)).await.is_ok() {
+                return Ok(true);
             }
         }
     }

@@ -13,8 +13,8 @@ use super::router::{PERIOD, Watch};
 use crate::record::writer::RecorderControl;
 use crate::zenoh_session;
 
-/// Longest time for which a start waits for a router. Ours: that of a handshake on a bad link; without a router, vehicles
-/// are served to the other readers.
+/// Longest time for which a start waits for a router. Ours: that of a handshake on a bad link; without a router,
+/// vehicles are served to the other readers.
 const START_WAITS_MAX: Duration = Duration::from_secs(2);
 
 /// The attempts to open a session, until one succeeds.

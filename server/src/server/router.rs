@@ -45,7 +45,9 @@ impl Watch {
             (true, None) => return,
             (true, Some(away)) => {
                 let seconds = away.since.elapsed().as_secs_f64();
-                tracing::info!(endpoints, "zenoh: a router is connected, after {seconds:.1} s without one");
+                if !away.reason.is_empty() {
+                    tracing::info!(endpoints, "zenoh: a router is connected, after {seconds:.1} s without one");
+                }
                 (self.away, self.asked) = (None, None);
             }
             (false, None) => {

@@ -25,6 +25,10 @@ const PERIOD_MAX: Duration = Duration::from_secs(60);
 /// and a store that hangs is to be named before.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
+/// Share of its validity that counts as what the link takes for a map while no router is connected. Ours: uploads get
+/// faster slowly, because their path may be another one.
+const AWAY_SHARE: f64 = 0.4;
+
 /// A file as it was when it was read: path, length, time of the newest change.
 type Seen = (PathBuf, u64, SystemTime);
 
@@ -58,15 +62,19 @@ pub(super) fn rate(options: &Store, vehicles: &Vehicles, valid: Vec<Duration>) -
     let vehicles = vehicles.clone();
     let share = move || {
         let now = Instant::now();
-        let took = vehicles.0.iter().map(|served| served.status.network.link(now));
-        let shares = took.zip(&valid).filter_map(|(took, valid)| Some(took?.div_duration_f64(*valid)));
+        let networks = vehicles.0.iter().map(|served| &served.status.network);
+        let shares = networks.zip(&valid).filter_map(|(network, valid)| {
+            let took = network.link(now).map(|took| took.div_duration_f64(*valid));
+            // A link that is cut: what is written to it now waits in front of the next maps.
+            took.or(network.is_away().then_some(AWAY_SHARE))
+        });
         shares.reduce(f64::max)
     };
     UploadRate::new(options.upload_kbit_s_max, Arc::new(share))
 }
 
-/// Sends each finished part to the store, at this rate, until the task is aborted. What the store does not confirm stays, and is sent
-/// again. With `delete`, what it confirms is deleted once it is older than `saved`.
+/// Sends each finished part to the store, at this rate, until the task is aborted. What the store does not confirm
+/// stays, and is sent again. With `delete`, what it confirms is deleted once it is older than `saved`.
 pub(super) async fn upload_finished(
     (options, rate): (Store, UploadRate),
     saved: Duration,

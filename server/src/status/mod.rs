@@ -5,7 +5,7 @@
 //! | [`vehicle`] | counts of engine, queue, recorder and readers -> one snapshot |
 //! | [`transports`] | readers that come, go and skip maps -> counts by transport |
 //! | [`window`], [`histogram`] | maps and packet counts -> rates, loss and latency of the last 10 s; buckets of times |
-//! | [`network`] | hung listeners, routers that are away, ends of certificates, times of the link -> problems in words |
+//! | [`network`] | hung listeners, absent routers, ends of certificates, times of the link -> problems in words |
 //! | [`health`] | what is known at one time -> ok, warn or error, with reasons |
 //! | [`assess`] | the status of a vehicle -> its state, again and again |
 //! | `message` | a snapshot and a state -> message, JSON |

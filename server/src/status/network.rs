@@ -52,6 +52,11 @@ impl Network {
         *locked(&self.router) = away;
     }
 
+    /// True if no router is connected, though one is configured.
+    pub fn is_away(&self) -> bool {
+        locked(&self.router).is_some()
+    }
+
     /// Notes when the certificates end, by their keys in the configuration, in seconds since the Unix epoch.
     pub fn set_certificates(&self, ends: &[(&'static str, i64)]) {
         ends.clone_into(&mut locked(&self.certificates));

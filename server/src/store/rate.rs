@@ -1,8 +1,8 @@
 //! How fast recordings are uploaded, so that the maps on the same link stay fresh.
 //!
 //! In: what share of their validity the link takes for the newest maps. Out: when the next bytes of an upload may be
-//! sent. Without a link that is measured, uploads are limited by `store.upload_kbit_s_max` alone; while nobody reads maps
-//! over it, they get faster until they have all of it.
+//! sent. Without a link that is measured, uploads are limited by `store.upload_kbit_s_max` alone; while no reader has
+//! maps over it, they get faster until they have all of it.
 //!
 //! An upload that is faster than what the maps leave of the link fills its queue, and the maps wait there. So the rate
 //! is halved when a map takes more than half its validity, and grows while maps are in time, as TCP does by losses.
@@ -22,8 +22,9 @@ const SHARE_CALM: f64 = 0.25;
 const RATE_MIN: f64 = 2e3;
 /// Rate, in bytes a second, when a reader's first map is on the link. Ours: a quarter of a thin link of 500 kbit/s.
 const RATE_BEGIN: f64 = 16e3;
-/// Growth of a rate that is used, in a second, and while no map was late for [`CALM`] or none is on the link. Ours: with the first, the link is
-/// full for less than a second before maps are late; with the second, 10 Mbit/s are reached in 2 s.
+/// Growth of a rate that is used, in a second; and while none is on the link, or none was late for [`CALM`]. Ours: with
+/// the first, the link is full for less than a second before maps are late; with the second, 10 Mbit/s are reached in
+/// 2 s.
 const GROWTH: [f64; 2] = [1.2, 8.0];
 /// Time without late maps after which the rate grows faster. Ours: longer than from a halving to the next.
 const CALM: Duration = Duration::from_secs(5);
@@ -88,8 +89,8 @@ impl Rate {
                     (self.bytes_s, self.halved) = ((sent / 2.0).max(RATE_MIN), Some(now));
                 }
             }
-            // Without maps it grows too, and not to any rate at once: a link that is cut carries no map either, and what
-            // were written to it then would wait in front of the next ones.
+            // Without maps it grows too, and not to any rate at once: a link that is cut carries no map either, and
+            // what were written to it then would wait in front of the next ones.
             Some(_) | None if is_used => {
                 let was_late = self.halved.is_some_and(|at| now.saturating_duration_since(at) < CALM);
                 let is_calm = link_share.is_none_or(|share| share < SHARE_CALM && !was_late);
@@ -251,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn an_upload_has_the_whole_link_while_nobody_reads_maps_and_gives_way_to_a_reader_that_comes() {
+    fn an_upload_has_the_whole_link_without_readers_and_gives_way_to_a_reader_that_comes() {
         let carried = drive(60, |_| 125e3, |second| !(10..20).contains(&second));
         assert!(carried.upload[13..20].iter().all(|bytes| *bytes > 0.99 * 125e3), "{:?}", carried.upload);
         let late = carried.maps_ms.iter().filter(|(number, ms)| *number >= 210 && *ms > 250.0).count();

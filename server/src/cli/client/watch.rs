@@ -39,8 +39,8 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
-    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447; or, with --ca, --cert and --key,
-    /// tls/HOST:7447.
+    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447; or, with --ca, --cert and
+    /// --key, tls/HOST:7447.
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
