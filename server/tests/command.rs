@@ -226,7 +226,7 @@ fn options_that_would_have_no_effect_are_refused() {
         (&["replay", path, "--record", path], 2, "this file is replayed; name another file"),
         (&["simulate", "flat", "--out", "x.pcap", "--telemetry-to", to], 3, "--telemetry-to"),
         (&["send", path, "--to", to, "--seed", "7"], 3, "--seed needs a fault of the network"),
-        (&["watch", "--zenoh", "tcp/localhost:1", "--ca", "ca.pem"], 3, "--ca"),
+        (&["watch", "--zenoh", "tcp/localhost:1", "--server", "localhost:1"], 3, "--server"),
         (&["check", "--default", "--config", "a.toml"], 3, "--config"),
     ];
     for (arguments, code, message) in refused {
