@@ -1,4 +1,4 @@
-//! Faults between machines and a thin uplink, in the short form of the program `machines`: six vehicles, five faults; a
+//! Faults between machines and a thin uplink, in the short form of the program `machines`: six vehicles, four faults; a
 //! vehicle whose uplink has 1 Mbit/s and 200 kbit/s. Validity and faults are longer than there, so that a machine with
 //! other work to do delays no map into staleness.
 
@@ -6,7 +6,7 @@ mod fixture;
 
 use std::sync::{Mutex, PoisonError};
 
-/// One test at a time has the processor: a machine with much to do delays maps.
+/// The names of the machines are those of the host, so one test at a time has them.
 static MACHINES: Mutex<()> = Mutex::new(());
 
 /// What `machines` prints.
@@ -51,8 +51,7 @@ fn row(line: &str) -> Option<Row> {
 #[cfg_attr(not(clearway_namespaces), ignore = "needs root and /dev/net/tun: apt-get install iproute2 python3 faketime")]
 fn only_streams_that_a_fault_concerns_go_stale_they_say_why_and_all_are_whole_afterwards() {
     let faults = [("cut", "no-newer"), ("server-behind", "old-on-arrival"), ("server-ahead", "in-the-future")];
-    // The link between the routers concerns no stream: planners read through the other router.
-    let faults = [&faults[..], &[("planner-ahead", "old-on-arrival"), ("cut-routers", "")]].concat();
+    let faults = [&faults[..], &[("planner-ahead", "old-on-arrival")]].concat();
     let names: Vec<_> = faults.iter().map(|(name, _)| *name).collect();
     let names = names.join(",");
     let arguments = ["--vehicles", "6", "--seconds", "4", "--valid-ms", "1500", "--faults", &names];
@@ -60,12 +59,10 @@ fn only_streams_that_a_fault_concerns_go_stale_they_say_why_and_all_are_whole_af
     let rows: Vec<_> = shown.lines().filter_map(row).collect();
     assert_eq!(rows.len(), faults.len(), "{shown}");
     for (row, (name, why)) in rows.iter().zip(&faults) {
-        let is_of_none = why.is_empty();
-        assert!(row.concerned[0] == row.concerned[1] && (row.concerned[1] == 0) == is_of_none, "{name}: {row:?}");
+        assert!(row.concerned[0] == row.concerned[1] && row.concerned[1] > 0, "{name}: {row:?}");
         assert_eq!(row.others[0], 0, "{}: streams that it does not concern went STALE: {shown}", row.fault);
         assert!(row.is_whole, "{name}: {shown}");
-        let is_said = row.said.contains(&format!("{why} {}", row.concerned[1]));
-        assert!(is_of_none || is_said, "{name}: {row:?}");
+        assert!(row.said.contains(&format!("{why} {}", row.concerned[1])), "{name}: {row:?}");
     }
 }
 

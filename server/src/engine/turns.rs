@@ -1,8 +1,9 @@
 //! Turns of the engines: as many work at once as there are processors.
 //!
-//! If more engines work than there are processors, the system divides the time among them, and each of their maps is as
-//! late as the last one. In turn, one map after the other is finished. An engine keeps its turn while events wait for
-//! it, at most until it has made a map. It does not wait for long: an engine that stands still must not stop the others.
+//! If more engines work than there are processors, the system divides the time among them, and each of their maps is
+//! as late as the last one. In turn, one map after the other is finished. An engine keeps its turn while events wait
+//! for it, at most until it has made a map. It does not wait for long: an engine that stands still must not stop the
+//! others.
 
 use std::num::NonZero;
 use std::sync::{Condvar, Mutex, PoisonError};

@@ -26,9 +26,9 @@ use crate::ingest::queue::{EventQueue, QueueClosedError};
 
 mod receive;
 
-/// Least and greatest time between two reads of a socket whose datagrams come faster. Ours: a map is that much later at
-/// most. After 1 ms the threads of one HDL-64E wake a third as often; after 4 ms its kernel buffer holds a sixth of what
-/// the kernel's own default allows.
+/// Least and greatest time between two reads of a socket whose datagrams come faster. Ours: a map is that much later
+/// at most. After 1 ms the threads of one HDL-64E wake a third as often; after 4 ms its kernel buffer holds a sixth of
+/// what the kernel's own default allows.
 const PAUSE_MS: RangeInclusive<u32> = 1..=4;
 /// Number of sockets of which each further one lengthens the pause by a millisecond. Ours: four vehicles with sockets
 /// for packets and for telemetry; then the threads of all sockets wake 4,000 times a second, however many there are.

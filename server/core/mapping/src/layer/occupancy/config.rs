@@ -48,10 +48,10 @@ pub struct OccupancyConfig {
     /// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
     /// that no sensor sees again leaves the third map; not tuned.
     pub hold_maps: u8,
-    /// With `variant = "polar"` and ego poses: number of maps in which a cell that was clear, and then was neither clear
-    /// nor occupied, does not become clear again; and a hidden cell becomes clear only in the second map in a row that
-    /// shows it clear. 0: both do at once. 5 is ours: of the changes along the borders of shadows half are undone within
-    /// five maps; not tuned.
+    /// With `variant = "polar"` and ego poses: number of maps in which a cell that was clear, and then was neither
+    /// clear nor occupied, does not become clear again; and a hidden cell becomes clear only in the second map in a row
+    /// that shows it clear. 0: both do at once. 5 is ours: of the changes along the borders of shadows half are undone
+    /// within five maps; not tuned.
     pub calm_maps: u8,
     /// What the channel `hits` contains. `reduced` is ours, because it costs fewer bytes (BENCHMARKS.md has the sizes);
     /// `counted` is the paper's (section 2).

@@ -6,7 +6,8 @@
 //! of each map, which makes deltas shorter, and no cell is clear that would not be without this. While the vehicle is
 //! fast, nearly every border moves from map to map, and nothing is replaced.
 //!
-//! What a cell is follows from the states of the last maps alone, so that maps that begin anew soon equal the others.
+//! What a cell is follows from the states of the last maps alone, so that the maps of a pipeline that begins later soon
+//! equal those of an earlier one.
 
 use super::class::OccupancyClass;
 
