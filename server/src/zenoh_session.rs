@@ -7,6 +7,7 @@ use zenoh::session::ZenohId;
 use zenoh::{Config, Session};
 
 use crate::config::{Zenoh as Options, ZenohMode};
+use crate::publish::listen::Budget;
 
 /// What one peer may cost: zenoh's setting, value in JSON5. A file named in `[zenoh]` has its own values; the files in
 /// `deploy/zenoh` have these. All values are ours, for the reasons beside them.
@@ -101,20 +102,26 @@ pub(crate) struct PeerNames {
     session: Session,
     names: BTreeMap<ZenohId, String>,
     read: Option<Instant>,
+    /// Reads because of unknown peers: who invents their ids does not keep the server reading.
+    reads: Budget,
 }
 
 impl PeerNames {
     /// Longest time for which the names are not read again. Ours.
     const AGE_MAX: Duration = Duration::from_secs(1);
+    /// Most reads for unknown peers at once, and a second. Ours: as many planners as may start together.
+    const READS_AT_ONCE: u32 = 100;
+    const READS_PER_SECOND: u32 = 20;
 
     pub(crate) fn new(session: &Session) -> Self {
-        Self { session: session.clone(), names: BTreeMap::new(), read: None }
+        let reads = Budget::new(Self::READS_AT_ONCE, Self::READS_PER_SECOND);
+        Self { session: session.clone(), names: BTreeMap::new(), read: None, reads }
     }
 
     /// The common name in the certificate of a peer; `None` if no link of this session leads to it, or without TLS.
     pub(crate) async fn name(&mut self, peer: ZenohId) -> Option<&str> {
         let is_old = self.read.is_none_or(|read| read.elapsed() > Self::AGE_MAX);
-        if is_old || !self.names.contains_key(&peer) {
+        if is_old || (!self.names.contains_key(&peer) && self.reads.take()) {
             let links = self.session.info().links().await;
             self.names = links.filter_map(|link| Some((*link.zid(), link.auth_identifier()?.to_owned()))).collect();
             self.read = Some(Instant::now());

@@ -1,5 +1,16 @@
 //! Finding a vehicle by its name, and the error for a name that does not exist.
 
+/// Longest part of a client's name in an error, in characters. Ours: a name of more is none.
+const NAME_CHARACTERS_MAX: usize = 64;
+
+/// A name as an error shows it: at most its first characters, because it is a client's and may have any length.
+pub fn shortened(name: &str) -> String {
+    match name.char_indices().nth(NAME_CHARACTERS_MAX) {
+        Some((end, _)) => format!("{}... ({} bytes)", &name[..end], name.len()),
+        None => name.to_owned(),
+    }
+}
+
 /// A request names a vehicle, sensor or layer that does not exist.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum UnknownNameError {
@@ -68,7 +79,7 @@ pub fn find_vehicle<'a, T>(
         let known = known.join(", ");
         match name {
             "" => UnknownNameError::NoVehicle { known },
-            name => UnknownNameError::Vehicle { name: name.to_owned(), known },
+            name => UnknownNameError::Vehicle { name: shortened(name), known },
         }
     })
 }
@@ -85,5 +96,11 @@ mod tests {
         let error = find(&["car", "van"], "").unwrap_err();
         assert_eq!(error.to_string(), "no vehicle is named: choose one of car, van");
         assert!(find(&["car"], "van").is_err());
+    }
+
+    #[test]
+    fn an_error_holds_the_first_characters_of_a_long_name() {
+        let error = find_vehicle(&["car"], &"ä".repeat(30_000), |of| of).unwrap_err().to_string();
+        assert!(error.contains("(60000 bytes)") && error.len() < 250, "{} bytes", error.len());
     }
 }

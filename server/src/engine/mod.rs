@@ -195,6 +195,7 @@ impl Engine {
             (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
         });
         let encoding = started.elapsed().saturating_sub(computed);
+        self.status.map_time.record(self.pipeline.newest_sweep().len(), computed + encoding);
         let speed_m_s = map.speed_mps;
         // The points come before the map, so that a reader of the map finds its points.
         if self.status.sweeps.receiver_count() > 0 {

@@ -2,19 +2,23 @@
 //! it.
 
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
 use clearway_proto::v1;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::sync::{Semaphore, watch};
 
-use super::observation::{self, Limits, ObservationError};
+use super::observation::{self, Bodies, Limits, ObservationError};
 use super::queue::EventQueue;
-use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, Receipt};
-use crate::base::directory::{UnknownNameError, find_vehicle};
+use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, Receipt, ScanTime};
+use super::stream_places::{StreamLimitError, StreamPlace, StreamPlaces};
+use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::base::sync::locked;
 use crate::config::Vehicle;
+use crate::status::map_time::MapTime;
 
 /// The gateway of one vehicle.
 #[derive(Debug)]
@@ -27,8 +31,12 @@ pub struct Gateway {
     /// half is for UDP.
     pub in_flight_max: usize,
     sensors: Mutex<Sensors>,
-    streams: Arc<Semaphore>,
-    streams_max: usize,
+    streams: StreamPlaces,
+    map_time: Arc<MapTime>,
+    /// Longest time that a map of scans may take.
+    map_time_max: Duration,
+    /// The time that the maps of waiting scans take, in microseconds: at most `map_time_max`.
+    waiting_us: Arc<Semaphore>,
     queue: EventQueue,
 }
 
@@ -40,7 +48,12 @@ struct Sensors {
     /// Number of clients that have declared each declared sensor, by its index. One without a client is withdrawn as
     /// soon as the queue has space.
     clients: BTreeMap<u16, usize>,
+    /// Number of points and of rays without a return of each sensor's newest scan, and when it came, ns since the Unix epoch.
+    newest_scans: BTreeMap<u16, (usize, i64)>,
 }
+
+/// A scan that is older has no part in the next map. Ours: two revolutions of the slowest sensor.
+const SCAN_AGE_NS_MAX: i64 = 400_000_000;
 
 impl Sensors {
     /// Index of the sensor of this name; of the only sensor if the name is empty.
@@ -52,27 +65,18 @@ impl Sensors {
         let present = sensors.iter().filter(|sensor| !sensor.is_withdrawn());
         let index = sensors.iter().position(|sensor| sensor.name == name && !sensor.is_withdrawn());
         index.and_then(|index| u16::try_from(index).ok()).ok_or_else(|| UnknownNameError::Sensor {
-            name: name.to_owned(),
+            name: shortened(name),
             vehicle: vehicle.to_owned(),
             known: present.map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", "),
         })
     }
 }
 
-/// All streams that a vehicle allows are open.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("vehicle {vehicle} has {streams_max} streams, as many as are allowed")]
-pub struct StreamLimitError {
-    /// The vehicle's name.
-    pub vehicle: Arc<str>,
-    /// Number of streams allowed.
-    pub streams_max: usize,
-}
-
 impl Gateway {
-    /// The gateway to a vehicle's queue.
-    pub fn new(vehicle: &Vehicle, queue: &EventQueue) -> Self {
+    /// The gateway to a vehicle's queue. A map of scans may take half the time for which it is valid, by `map_time`.
+    pub fn new(vehicle: &Vehicle, queue: &EventQueue, map_time: Arc<MapTime>) -> Self {
         let streams_max = vehicle.ingest.streams_max;
+        let map_time_max = Duration::from_millis(vehicle.maps.valid_ms.into()) / 2;
         Self {
             vehicle: vehicle.name.as_str().into(),
             limits: Limits {
@@ -80,24 +84,39 @@ impl Gateway {
                 ..Limits::from_points_max(vehicle.ingest.points_max)
             },
             in_flight_max: (vehicle.ingest.events_max(vehicle.queue) / streams_max).max(1),
-            sensors: Mutex::new(Sensors { config: vehicle.core(), clients: BTreeMap::new() }),
-            streams: Arc::new(Semaphore::new(streams_max)),
-            streams_max,
+            sensors: Mutex::new(Sensors {
+                config: vehicle.core(),
+                clients: BTreeMap::new(),
+                newest_scans: BTreeMap::new(),
+            }),
+            streams: StreamPlaces::new(streams_max),
+            map_time,
+            map_time_max,
+            waiting_us: Arc::new(Semaphore::new(micros(map_time_max) as usize)),
             queue: queue.clone(),
         }
     }
 
-    /// A permit for one stream of this vehicle; the stream holds it while it is open.
+    /// A place for one stream of this vehicle; the stream holds it while it is open.
     ///
     /// # Errors
-    /// [`StreamLimitError`] if all streams that the vehicle allows are open.
-    pub fn acquire_stream(&self) -> Result<OwnedSemaphorePermit, StreamLimitError> {
-        let permit = self.streams.clone().try_acquire_owned();
-        permit.map_err(|_| StreamLimitError { vehicle: self.vehicle.clone(), streams_max: self.streams_max })
+    /// [`StreamLimitError`] if there is none for this sender.
+    pub fn take_stream(&self, sender: IpAddr) -> Result<StreamPlace, StreamLimitError> {
+        self.streams.take(sender)
     }
 
-    /// Checks one observation of `bytes` bytes and pushes its events. An immediate refusal goes to `session`; the
-    /// outcome of each event goes to `outcomes`.
+    /// Waits until the scans before this observation leave the engine time for it, so that no map is late because
+    /// scans came faster than maps are made. Only a scan waits.
+    pub async fn wait_for_time(&self, observation: &v1::Observation) -> ScanTime {
+        let Some(v1::observation::Body::Scan(scan)) = &observation.body else { return ScanTime::default() };
+        let rays = scan.x.len() / size_of::<f32>() + scan.no_returns.len() / size_of::<[f32; 3]>();
+        let took = self.map_time.of(rays).min(self.map_time_max);
+        // The semaphore is never closed.
+        ScanTime(self.waiting_us.clone().acquire_many_owned(micros(took)).await.ok())
+    }
+
+    /// Checks one observation of `bytes` bytes and pushes its events; a scan holds `time` until it is processed.
+    /// An immediate refusal goes to `session`; the outcome of each event goes to `outcomes`.
     ///
     /// # Errors
     /// [`UnknownNameError::Sensor`] if the vehicle has no such sensor; `session` has the refusal already.
@@ -105,6 +124,7 @@ impl Gateway {
         &self,
         observation: v1::Observation,
         bytes: usize,
+        mut time: ScanTime,
         session: &mut ClientSession,
         outcomes: &OutcomeSender,
     ) -> Result<(), UnknownNameError> {
@@ -126,8 +146,10 @@ impl Gateway {
             Err(unknown) => return refuse(unknown, session),
         };
         let now_ns = self.queue.now_ns();
-        let decoded = observation::decode(observation, &self.limits);
-        match decoded.and_then(|bodies| observation::check_stamps(bodies, now_ns, &self.limits)) {
+        let decoded = observation::decode(observation, &self.limits)
+            .and_then(|bodies| observation::check_stamps(bodies, now_ns, &self.limits))
+            .and_then(|bodies| self.check_time(bodies, known, now_ns));
+        match decoded {
             Err(error) => {
                 session.begin(number, 0, 0);
                 self.record_drop(if concerns_vehicle { UNKNOWN_SOURCE } else { known }, error.reason());
@@ -142,7 +164,8 @@ impl Gateway {
                 };
                 session.begin(number, bodies.len(), bytes);
                 for (captured_ns, body) in bodies {
-                    let receipt = Receipt::new(ObservationId { client, number }, outcomes);
+                    let id = ObservationId { client, number };
+                    let receipt = Receipt::new(id, std::mem::take(&mut time), outcomes);
                     match body {
                         Body::Sensor(sensor) => {
                             self.push_declaration(captured_ns, sensor, receipt, &mut sensors, session);
@@ -153,6 +176,26 @@ impl Gateway {
             }
         }
         Ok(())
+    }
+
+    /// Returns `bodies` if a map of their scan, together with the newest scans of the other sensors, does not take too
+    /// long.
+    fn check_time(&self, bodies: Bodies, source: u16, now_ns: i64) -> Result<Bodies, ObservationError> {
+        let Some(scan) =
+            bodies.iter().find_map(|(_, body)| if let Body::Scan(scan) = body { Some(scan) } else { None })
+        else {
+            return Ok(bodies);
+        };
+        let points = scan.x.len() + scan.no_returns.len();
+        let newest = &mut locked(&self.sensors).newest_scans;
+        newest.retain(|of, (_, came_ns)| *of != source && now_ns.saturating_sub(*came_ns) < SCAN_AGE_NS_MAX);
+        let others = newest.values().map(|(points, _)| points).sum();
+        let takes = self.map_time.of(points.saturating_add(others));
+        if takes > self.map_time_max {
+            return Err(ObservationError::Time { points, others, takes, takes_max: self.map_time_max });
+        }
+        newest.insert(source, (points, now_ns));
+        Ok(bodies)
     }
 
     /// Counts a refused observation and adds the refusal to the client's next report.
@@ -196,7 +239,7 @@ impl Gateway {
 
     /// Withdraws the sensors whose clients have ended, as far as the queue has space.
     fn withdraw_without_client(&self, sensors: &mut Sensors) {
-        let Sensors { config, clients } = sensors;
+        let Sensors { config, clients, .. } = sensors;
         clients.retain(|source, clients| {
             let is_withdrawn = *clients == 0 && self.queue.push_if_space(*source, Body::Withdrawn);
             if is_withdrawn {
@@ -217,7 +260,7 @@ impl Gateway {
         session: &mut ClientSession,
     ) {
         self.withdraw_without_client(sensors);
-        let Sensors { config, clients } = sensors;
+        let Sensors { config, clients, .. } = sensors;
         let at = |is_it: &dyn Fn(&SensorConfig) -> bool| config.sensors.iter().position(is_it);
         let known = at(&|known| *known == *sensor);
         let index = known.or_else(|| at(&SensorConfig::is_withdrawn)).unwrap_or(config.sensors.len());
@@ -240,6 +283,11 @@ impl Gateway {
     }
 }
 
+/// Whole microseconds, at least one.
+fn micros(time: Duration) -> u32 {
+    u32::try_from(time.as_micros()).unwrap_or(u32::MAX).max(1)
+}
+
 /// True if an observation concerns no sensor but the whole vehicle.
 fn concerns_vehicle(observation: &v1::Observation) -> bool {
     use v1::observation::Body::{Declaration, EgoPose, Road};
@@ -250,8 +298,8 @@ fn concerns_vehicle(observation: &v1::Observation) -> bool {
 #[derive(Clone, Debug)]
 pub struct Gateways {
     all: Arc<[Arc<Gateway>]>,
-    /// One permit for each stream of any vehicle, also for a stream that has not named its vehicle yet.
-    streams: Arc<Semaphore>,
+    /// A place for each stream of any vehicle, also for a stream that has not named its vehicle yet.
+    streams: StreamPlaces,
     stop: watch::Receiver<bool>,
 }
 
@@ -259,7 +307,7 @@ impl Gateways {
     /// The gateways `all`; their streams end once `stop` is true.
     pub fn new(all: impl IntoIterator<Item = Gateway>, stop: watch::Receiver<bool>) -> Self {
         let all: Arc<[Arc<Gateway>]> = all.into_iter().map(Arc::new).collect();
-        let streams = Arc::new(Semaphore::new(all.iter().map(|gateway| gateway.streams_max).sum()));
+        let streams = StreamPlaces::new(all.iter().map(|gateway| gateway.streams.places()).sum());
         Self { all, streams, stop }
     }
 
@@ -277,9 +325,12 @@ impl Gateways {
         find_vehicle(&self.all, name, |gateway| &gateway.vehicle)
     }
 
-    /// A permit for one stream of any vehicle; `None` if all are in use.
-    pub fn acquire_stream(&self) -> Option<OwnedSemaphorePermit> {
-        self.streams.clone().try_acquire_owned().ok()
+    /// A place for one stream of any vehicle.
+    ///
+    /// # Errors
+    /// [`StreamLimitError`] if there is none for this sender.
+    pub fn take_stream(&self, sender: IpAddr) -> Result<StreamPlace, StreamLimitError> {
+        self.streams.take(sender)
     }
 
     /// Length of the longest message that any vehicle allows, in bytes.
@@ -291,5 +342,72 @@ impl Gateways {
     pub async fn stopped(&mut self) {
         // An error means that the sender is gone, so the server stops as well.
         let _ = self.stop.wait_for(|stop| *stop).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clearway_proto::packed::pack;
+    use futures::FutureExt;
+    use tokio::sync::mpsc::unbounded_channel;
+
+    use super::*;
+    use crate::config::Config;
+    use crate::ingest::queue::event_queue;
+
+    fn scan(number: u64, points: usize) -> v1::Observation {
+        let floats = pack(&vec![1.0_f32; points]);
+        let scan = v1::Scan { x: floats.clone(), y: floats.clone(), z: floats, ..Default::default() };
+        v1::Observation { number, body: Some(v1::observation::Body::Scan(scan)), ..Default::default() }
+    }
+
+    /// The first maps count as 0.1 ms for each thousand points and 2 ms beside them.
+    fn vehicle(valid_ms: u32) -> Vehicle {
+        let mut vehicle = Config::of_one_vehicle("car", "top").vehicles.remove(0);
+        vehicle.maps.valid_ms = valid_ms;
+        vehicle
+    }
+
+    #[test]
+    fn a_scan_waits_until_those_before_it_leave_the_engine_time() {
+        let (queue, events) = event_queue(16);
+        let gateway = Gateway::new(&vehicle(40), &queue, Arc::default());
+        let (outcomes, _reports) = unbounded_channel();
+        let mut session = ClientSession::new(0);
+        for number in 1..=2 {
+            let time = gateway.wait_for_time(&scan(number, 80_000)).now_or_never().expect("10 of 20 ms");
+            gateway.push(scan(number, 80_000), 0, time, &mut session, &outcomes).unwrap();
+        }
+        let third = scan(3, 80_000);
+        assert!(gateway.wait_for_time(&third).now_or_never().is_none(), "two scans of 10 ms wait for the engine");
+        let pose = v1::observation::Body::EgoPose(v1::EgoPose::default());
+        let pose = v1::Observation { body: Some(pose), ..Default::default() };
+        assert!(gateway.wait_for_time(&pose).now_or_never().is_some(), "a pose takes no time");
+        drop(events.recv().unwrap());
+        assert!(gateway.wait_for_time(&third).now_or_never().is_some());
+    }
+
+    #[test]
+    fn a_scan_is_refused_if_its_map_would_take_half_the_validity_also_together_with_other_sensors() {
+        let (queue, events) = event_queue(16);
+        let mut vehicle = vehicle(40);
+        vehicle.sensors.push(SensorConfig { name: "rear".into(), ..vehicle.sensors[0].clone() });
+        let gateway = Gateway::new(&vehicle, &queue, Arc::default());
+        let (outcomes, _reports) = unbounded_channel();
+        let mut session = ClientSession::new(0);
+        let mut push = |number, sensor: &str, points| {
+            let observation = v1::Observation { sensor: sensor.into(), ..scan(number, points) };
+            gateway.push(observation, 0, ScanTime::default(), &mut session, &outcomes).unwrap();
+            session.next_report().map(|report| report.refused).unwrap_or_default()
+        };
+        let refused = push(1, "top", 180_001).remove(0);
+        let message = "scan with 180001 points, beside 0 of other sensors: a map of them takes 20 ms; up to 20 ms are \
+                       allowed, half of maps.valid_ms";
+        assert_eq!((&*refused.reason, &*refused.message), ("scan_time", message));
+        assert!(push(2, "top", 100_000).is_empty());
+        let refused = push(3, "rear", 100_000).remove(0);
+        assert!(refused.message.contains("100000 points, beside 100000 of other sensors"), "{}", refused.message);
+        assert!(push(4, "rear", 70_000).is_empty() && push(5, "top", 110_000).is_empty());
+        assert_eq!(events.try_iter().count(), 3);
     }
 }

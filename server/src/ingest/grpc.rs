@@ -5,6 +5,7 @@
 //! returns the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as
 //! few reports as the transport can send.
 
+use std::net::Ipv4Addr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,13 +13,13 @@ use std::time::Duration;
 use clearway_proto::v1;
 use futures::{Stream, stream};
 use prost::Message;
-use tokio::sync::OwnedSemaphorePermit;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
 use super::gateway::{Gateway, Gateways};
-use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
-
+use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, ScanTime};
+use super::stream_places::StreamPlace;
+use crate::publish::listen::Place;
 use crate::publish::listen::access::Caller;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
@@ -52,9 +53,11 @@ impl IngestService for Ingest {
         &self,
         request: Request<Streaming<v1::Observation>>,
     ) -> Result<Response<Self::StreamStream>, Status> {
-        let full = |what: &str| Status::resource_exhausted(format!("{what}; close one first"));
-        let permit = self.gateways.acquire_stream().ok_or_else(|| full("every stream the server allows is open"))?;
+        let full = |of: &str, error| Status::resource_exhausted(format!("{of}: {error}; close one first"));
         let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
+        let sender =
+            request.extensions().get::<Arc<Place>>().map_or(Ipv4Addr::UNSPECIFIED.into(), |place| place.host());
+        let place = self.gateways.take_stream(sender).map_err(|error| full("this server", error))?;
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
             .await
@@ -67,13 +70,13 @@ impl IngestService for Ingest {
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let gateway = self.gateways.find(&first.vehicle)?.clone();
         caller.check_vehicle(&gateway.vehicle)?;
-        let vehicle_permit = gateway.acquire_stream().map_err(|error| full(&error.to_string()))?;
-        let permits = [permit, vehicle_permit];
-        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), permits);
+        let of_vehicle =
+            gateway.take_stream(sender).map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), [place, of_vehicle]);
         if first.body.is_none() {
             stream.acknowledge_opening(&first);
         } else {
-            stream.push(first);
+            stream.waiting = Some(first);
         }
         Ok(Response::new(Box::pin(stream.reports())))
     }
@@ -83,6 +86,8 @@ impl IngestService for Ingest {
 struct IngestStream {
     /// `None` once the stream reads no more observations.
     observations: Option<Streaming<v1::Observation>>,
+    /// Waits until the engine has time for it.
+    waiting: Option<v1::Observation>,
     gateway: Arc<Gateway>,
     gateways: Gateways,
     session: ClientSession,
@@ -91,7 +96,7 @@ struct IngestStream {
     /// The status that ends the stream, after everything in flight is reported.
     end: Option<Status>,
     // The last field, so that it is dropped last.
-    _permits: [OwnedSemaphorePermit; 2],
+    _places: [StreamPlace; 2],
 }
 
 impl IngestStream {
@@ -99,18 +104,19 @@ impl IngestStream {
         observations: Streaming<v1::Observation>,
         gateway: Arc<Gateway>,
         gateways: Gateways,
-        permits: [OwnedSemaphorePermit; 2],
+        places: [StreamPlace; 2],
     ) -> Self {
         let (outcome_sender, outcomes) = unbounded_channel();
         Self {
             observations: Some(observations),
+            waiting: None,
             gateway,
             gateways,
             session: ClientSession::new(0),
             outcome_sender,
             outcomes,
             end: None,
-            _permits: permits,
+            _places: places,
         }
     }
 
@@ -127,11 +133,11 @@ impl IngestStream {
             if let Some(report) = self.session.next_report() {
                 return Ok(Some(report));
             }
-            if self.observations.is_none() && self.session.is_idle() {
+            if self.observations.is_none() && self.waiting.is_none() && self.session.is_idle() {
                 return self.end.take().map_or(Ok(None), Err);
             }
             let (events_max, bytes_max) = (self.gateway.in_flight_max, self.gateway.limits.message_bytes_max);
-            let has_credit = self.session.has_credit(events_max, bytes_max);
+            let has_credit = self.waiting.is_none() && self.session.has_credit(events_max, bytes_max);
             tokio::select! {
                 // Outcomes first, because they give credit.
                 biased;
@@ -139,8 +145,11 @@ impl IngestStream {
                 () = self.gateways.stopped(), if self.observations.is_some() => {
                     self.stop_reading(Some(Status::unavailable("the server stops")));
                 }
+                time = time_for(&self.gateway, self.waiting.as_ref()), if self.waiting.is_some() => {
+                    self.push_waiting(time);
+                }
                 observation = next_observation(&mut self.observations), if has_credit => match observation {
-                    Ok(Some(observation)) => self.push(observation),
+                    Ok(Some(observation)) => self.waiting = Some(observation),
                     Ok(None) => self.stop_reading(None),
                     Err(status) => {
                         if is_refusal(&status) {
@@ -160,16 +169,17 @@ impl IngestStream {
         self.session.begin(first.number, 0, 0);
     }
 
-    fn push(&mut self, mut observation: v1::Observation) {
+    fn push_waiting(&mut self, time: ScanTime) {
+        let Some(mut observation) = self.waiting.take() else { return };
         observation.client = 0;
         let bytes = observation.encoded_len();
-        if let Err(unknown) = self.gateway.push(observation, bytes, &mut self.session, &self.outcome_sender) {
+        if let Err(unknown) = self.gateway.push(observation, bytes, time, &mut self.session, &self.outcome_sender) {
             self.stop_reading(Some(unknown.into()));
         }
     }
 
     fn stop_reading(&mut self, end: Option<Status>) {
-        self.observations = None;
+        (self.observations, self.waiting) = (None, None);
         self.end = end;
     }
 }
@@ -184,6 +194,14 @@ impl Drop for IngestStream {
 /// True if the message was too long or not an observation, false for a failure of the network.
 fn is_refusal(status: &Status) -> bool {
     matches!(status.code(), Code::OutOfRange | Code::Internal)
+}
+
+/// The engine's time for an observation; for ever if there is none.
+async fn time_for(gateway: &Gateway, observation: Option<&v1::Observation>) -> ScanTime {
+    match observation {
+        Some(observation) => gateway.wait_for_time(observation).await,
+        None => std::future::pending().await,
+    }
 }
 
 async fn next_observation(

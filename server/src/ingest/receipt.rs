@@ -5,6 +5,7 @@ use std::collections::{BTreeSet, VecDeque};
 
 use clearway_mapping::error::EventError;
 use clearway_proto::v1;
+use tokio::sync::OwnedSemaphorePermit;
 use tokio::sync::mpsc::UnboundedSender;
 
 /// The outcome of one event.
@@ -42,18 +43,23 @@ pub struct ObservationId {
 /// Where outcomes are sent. Unbounded, but it holds no more outcomes than there are events in flight.
 pub type OutcomeSender = UnboundedSender<(ObservationId, Outcome)>;
 
+/// The engine's time for a waiting scan, free again when this is dropped; `None` for an event that is no scan.
+#[derive(Debug, Default)]
+pub struct ScanTime(pub Option<OwnedSemaphorePermit>);
+
 /// Delivers the outcome of one event exactly once. A receipt that is dropped undelivered, for example with the queue of
 /// a stopped engine, delivers a refusal with the reason `stopped`.
 #[derive(Debug)]
 pub struct Receipt {
     id: ObservationId,
     outcomes: Option<OutcomeSender>,
+    _time: ScanTime,
 }
 
 impl Receipt {
-    /// A receipt for one event of the observation `id`.
-    pub fn new(id: ObservationId, outcomes: &OutcomeSender) -> Self {
-        Self { id, outcomes: Some(outcomes.clone()) }
+    /// A receipt for one event of the observation `id`, which holds `time` until then.
+    pub fn new(id: ObservationId, time: ScanTime, outcomes: &OutcomeSender) -> Self {
+        Self { id, outcomes: Some(outcomes.clone()), _time: time }
     }
 
     /// Delivers the outcome.

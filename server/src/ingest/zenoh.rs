@@ -159,7 +159,7 @@ impl Ingest {
                         }
                         None => Ok(()),
                     };
-                    self.push(&key, bytes, allowed, &mut clients, &outcome_sender);
+                    self.push(&key, bytes, allowed, &mut clients, &outcome_sender).await;
                 }
                 _ = repeat.tick() => {
                     clients.request_repetitions();
@@ -180,7 +180,7 @@ impl Ingest {
         }
     }
 
-    fn push(
+    async fn push(
         &self,
         key: &str,
         bytes: Bytes,
@@ -219,7 +219,8 @@ impl Ingest {
             }
         }
         // The gateway counts and reports an unknown sensor itself.
-        let _ = self.gateway.push(observation, length, session, outcomes);
+        let time = self.gateway.wait_for_time(&observation).await;
+        let _ = self.gateway.push(observation, length, time, session, outcomes);
     }
 }
 

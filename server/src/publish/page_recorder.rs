@@ -42,9 +42,9 @@ enum Button {
 }
 
 impl PageRecorder {
-    /// The recorder as an operator reaches it; `None` for other callers.
+    /// The recorder as an operator reaches it whom nothing limits; `None` for other callers.
     pub fn new(control: RecorderControl, caller: &Caller) -> Option<Self> {
-        caller.is_operator().then(|| Self { control, pending: FuturesUnordered::new() })
+        caller.may_record().then(|| Self { control, pending: FuturesUnordered::new() })
     }
 
     /// The state of the recorder.

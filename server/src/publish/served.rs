@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::watch;
 
-use crate::base::directory::{UnknownNameError, find_vehicle};
+use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::engine::newest::Newest;
 use crate::status::VehicleStatus;
 
@@ -58,7 +58,7 @@ impl Served {
         match layers.iter().find(|layer| !known.contains(&layer.as_str())) {
             None => Ok(()),
             Some(name) => Err(UnknownNameError::Layer {
-                name: name.clone(),
+                name: shortened(name),
                 vehicle: self.status.name.to_string(),
                 known: known.join(", "),
             }),

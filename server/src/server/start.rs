@@ -284,8 +284,10 @@ impl Running {
 
     /// The gateways of the vehicles that allow observations.
     fn gateways(&self, config: &Config) -> Gateways {
-        let enabled = config.vehicles.iter().zip(&self.inputs).filter(|(vehicle, _)| vehicle.ingest.enabled);
-        Gateways::new(enabled.map(|(vehicle, input)| Gateway::new(vehicle, &input.queue)), self.stop.subscribe())
+        let vehicles = config.vehicles.iter().zip(&self.inputs).zip(self.vehicles.statuses());
+        let enabled = vehicles.filter(|((vehicle, _), _)| vehicle.ingest.enabled);
+        let gateway = |(vehicle, input, status)| Gateway::new(vehicle, &input.queue, status.map_time.clone());
+        Gateways::new(enabled.map(gateway), self.stop.subscribe())
     }
 
     fn serve(&mut self, listeners: Listeners, gateways: Gateways) {

@@ -22,7 +22,7 @@ pub const PACKET_REASONS: [&str; 18] = [
     "telemetry",
 ];
 /// Reasons for which messages are no observations.
-pub const OBSERVATION_REASONS: [&str; 13] = [
+pub const OBSERVATION_REASONS: [&str; 14] = [
     "body",
     "columns",
     "message",
@@ -35,6 +35,7 @@ pub const OBSERVATION_REASONS: [&str; 13] = [
     "ros_frames",
     "ros_kind",
     "ros_message",
+    "scan_time",
     "stamp_ahead",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.

@@ -146,6 +146,41 @@ async fn points_at_impossible_positions_are_counted_and_dropped() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_scan_whose_map_would_be_late_is_refused_and_one_sender_never_has_all_streams() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = scanned_config();
+    config.vehicles[0].ingest.streams_max = 3;
+    config.vehicles[0].maps.valid_ms = 60;
+    let running = start(config, &folder.path().join("r.mcap")).await;
+    let floats: Bytes = vec![0; 4 * 400_000].into();
+    let large = v1::Scan { stamp_ns: 1, x: floats.clone(), y: floats.clone(), z: floats, ..Default::default() };
+    // Before the first map the server counts on 0.1 ms for each thousand points.
+    let (reports, end) = reports(&running, vec![scan(1, large), scan(2, plain(100_000_000))]).await;
+    let refusals: Vec<_> = reports.iter().flat_map(|report| &report.refused).collect();
+    assert!(end.is_none() && refusals.len() == 1 && refusals[0].reason == "scan_time", "{refusals:?} {end:?}");
+    assert!(refusals[0].message.contains("400000 points") && refusals[0].message.contains("up to 30 ms"));
+    let status = running.vehicles.0[0].status.snapshot();
+    assert_eq!((status.ledger.refused.get("observation"), status.ledger.decoded), (Some(&1), 1));
+
+    let client = client(&running).await;
+    let refused = within("two streams", async {
+        let mut held = Vec::new();
+        loop {
+            match client.ingest("car").await {
+                Ok(stream) => held.push(stream),
+                // The stream before may not have ended yet.
+                Err(_) if held.len() < 2 => tokio::task::yield_now().await,
+                Err(error) => return (held, error.to_string()),
+            }
+        }
+    });
+    let (held, error) = refused.await;
+    assert!(held.len() == 2 && error.contains("one is kept for another sender"), "{} {error}", held.len());
+    drop(held);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn unknown_vehicles_surplus_streams_and_large_scans_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = scanned_config();
@@ -162,7 +197,7 @@ async fn unknown_vehicles_surplus_streams_and_large_scans_are_refused() {
 
     let mut first = ingester(&running).await;
     let (code, reason) = refused(client.ingest("car").await);
-    assert!(code == "ResourceExhausted" && reason.contains("allow"), "{reason}");
+    assert!(code == "ResourceExhausted" && reason.contains("all 1 streams"), "{reason}");
 
     first.send(Observation::end("bottom")).await.unwrap();
     let refusals = within("a refusal", first.settled()).await.unwrap();

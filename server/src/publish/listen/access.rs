@@ -54,6 +54,9 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
 ];
 
+/// How the RPCs of the recorder begin.
+const RECORDING: &str = "/clearway.v1.RecordingService/";
+
 /// The paths of the page, the metrics and Foxglove, and the roles that may use them; operators may use all. Every
 /// client may use a path without roles. Every other path is a file of the page.
 pub const PATHS: &[(&str, &[Role])] = &[
@@ -95,6 +98,16 @@ impl Caller {
     /// True if the client may do what only operators may.
     pub fn is_operator(&self) -> bool {
         self.is_operator
+    }
+
+    /// True if the client may reach every vehicle and every layer.
+    fn is_unlimited(&self) -> bool {
+        self.limits.iter().any(|only| only.vehicles.is_empty() && only.layers.is_empty())
+    }
+
+    /// True if the client may control the recorder: a recording holds every vehicle and every layer.
+    pub fn may_record(&self) -> bool {
+        self.is_operator && self.is_unlimited()
     }
 
     fn limits_for(&self, vehicle: &str) -> impl Iterator<Item = &Only> {
@@ -168,10 +181,18 @@ impl Access {
     /// Checks that a client with these names may call the RPC `path`; returns what it may reach.
     ///
     /// # Errors
-    /// `PermissionDenied` with the names, their roles and the roles that are allowed, if none of its roles is allowed.
+    /// `PermissionDenied` with the names, their roles and the roles that are allowed, if none of its roles is allowed;
+    /// or if the recorder is asked for and the client is limited to some vehicles or layers.
     pub fn check(&self, path: &str, names: &[String]) -> Result<Caller, Status> {
         let allowed = RPCS.iter().find(|(rpc, _)| *rpc == path).map_or(&[][..], |(_, allowed)| allowed);
-        self.check_roles(path, allowed, names)
+        let caller = self.check_roles(path, allowed, names)?;
+        match caller.may_record() || !path.starts_with(RECORDING) {
+            true => Ok(caller),
+            false => Err(Status::permission_denied(format!(
+                "{path}: a recording holds every vehicle and layer, and grpc.access.only limits [{}]",
+                names.join(", ")
+            ))),
+        }
     }
 
     /// As [`check`](Self::check), for a path of the page, the metrics and Foxglove.

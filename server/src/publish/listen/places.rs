@@ -356,6 +356,11 @@ impl Place {
         self.occupant.peer
     }
 
+    /// What counts as one address: that of the peer, or its IPv6 network of 64 bits.
+    pub fn host(&self) -> IpAddr {
+        self.occupant.host
+    }
+
     /// Is cancelled when the connection is to be closed.
     pub fn closing(&self) -> CancellationToken {
         self.occupant.closing.clone()
