@@ -18,7 +18,7 @@ pub mod turns;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{EgoPose, Event};
@@ -27,7 +27,7 @@ use clearway_proto::v1;
 use nalgebra::Vector3;
 use tokio::sync::watch;
 
-use crate::base::clock::now_ns;
+use crate::base::clock::{Stopwatch, now_ns};
 use crate::encode::{self, EncodedMap, Replayed};
 use crate::engine::newest::Newest;
 use crate::engine::turns::{Turn, Turns};
@@ -117,7 +117,7 @@ impl Engine {
             self.newest.send_replace(None);
             self.status.sweeps.send_replace(None);
         }
-        self.publish(Instant::now(), None);
+        self.publish(Stopwatch::start(), None);
     }
 
     /// Copies the ledger and the sensors into the status; the thread of [`Engine::start`] does so whenever no event
@@ -156,10 +156,10 @@ impl Engine {
 
     /// Computes the newest map again for readers that came after the last event, if it was computed without any reader.
     fn complete_newest_map(&mut self) {
-        let started = Instant::now();
+        let stopwatch = Stopwatch::start();
         self.update_layers();
         if self.pipeline.remake_newest_map().is_some() {
-            self.publish(started, None);
+            self.publish(stopwatch, None);
         }
     }
 
@@ -167,11 +167,11 @@ impl Engine {
         if let Some(recording) = &mut self.recording {
             recording.record_event(event);
         }
-        let (started, waited) = (Instant::now(), duration(now_ns().saturating_sub(event.arrival_ns)));
+        let (stopwatch, waited) = (Stopwatch::start(), duration(now_ns().saturating_sub(event.arrival_ns)));
         self.update_layers();
         let outcome = self.pipeline.step(event).map(|map| map.is_some());
         match &outcome {
-            Ok(true) => self.publish(started, waited),
+            Ok(true) => self.publish(stopwatch, waited),
             Ok(false) => {}
             Err(error) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
@@ -183,10 +183,10 @@ impl Engine {
         outcome.map(|_| ())
     }
 
-    /// Encodes the newest map and gives it to readers, recorder and observer. Its computation has `started` then, after
-    /// its event had `waited`, if that is known.
-    fn publish(&mut self, started: Instant, waited: Option<Duration>) {
-        let computed = started.elapsed();
+    /// Encodes the newest map and gives it to readers, recorder and observer. The stopwatch was started with its
+    /// computation, after its event had `waited`, if that is known.
+    fn publish(&mut self, stopwatch: Stopwatch, waited: Option<Duration>) {
+        let computed = stopwatch.elapsed();
         let Some(map) = self.pipeline.newest_map() else { return };
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
         let encoded = (!self.status.layers.is_empty()).then(|| {
@@ -194,8 +194,8 @@ impl Engine {
             let (name, boot_id) = (self.status.name.clone(), self.status.boot_id);
             (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
         });
-        let encoding = started.elapsed().saturating_sub(computed);
-        self.status.map_time.record(self.pipeline.newest_sweep().len(), computed + encoding);
+        let encoding = stopwatch.elapsed().saturating_sub(computed);
+        self.status.map_time.record(self.pipeline.newest_sweep().x.len(), stopwatch.worked());
         let speed_m_s = map.speed_mps;
         // The points come before the map, so that a reader of the map finds its points.
         if self.status.sweeps.receiver_count() > 0 {

@@ -7,6 +7,7 @@
 //! | `zenoh` | observations over zenoh -> gateway; reports back |
 //! | [`gateway`] | one observation of a client -> events on the queue of its vehicle |
 //! | [`observation`] | `clearway.v1.Observation` -> event bodies, or the reason of the refusal |
+//! | [`stream_places`] | streams of senders -> places: so many at once, and never all for one sender |
 //! | [`receipt`] | outcome of an event -> report to its client |
 //! | [`ros`] | ROS 2 messages, live or from a file -> readings |
 //! | [`files`] | captures, MCAP files, scans -> readings |
@@ -21,6 +22,7 @@ pub mod observation;
 pub mod queue;
 pub mod receipt;
 pub mod ros;
+pub mod stream_places;
 pub mod udp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

@@ -287,8 +287,8 @@ mod tests {
     fn a_receipt_that_is_dropped_delivers_that_the_engine_has_stopped() {
         let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
         let id = ObservationId { client: 1, number: 2 };
-        drop(Receipt::new(id, &sender));
-        Receipt::new(id, &sender).deliver(Outcome::Accepted);
+        drop(Receipt::new(id, ScanTime::default(), &sender));
+        Receipt::new(id, ScanTime::default(), &sender).deliver(Outcome::Accepted);
         assert!(matches!(outcomes.try_recv(), Ok((of, Outcome::Refused { reason: "stopped", .. })) if of == id));
         assert_eq!(outcomes.try_recv(), Ok((id, Outcome::Accepted)));
         assert!(outcomes.try_recv().is_err(), "each is delivered once");

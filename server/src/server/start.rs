@@ -286,8 +286,9 @@ impl Running {
     fn gateways(&self, config: &Config) -> Gateways {
         let vehicles = config.vehicles.iter().zip(&self.inputs).zip(self.vehicles.statuses());
         let enabled = vehicles.filter(|((vehicle, _), _)| vehicle.ingest.enabled);
-        let gateway = |(vehicle, input, status)| Gateway::new(vehicle, &input.queue, status.map_time.clone());
-        Gateways::new(enabled.map(gateway), self.stop.subscribe())
+        let gateways =
+            enabled.map(|((vehicle, input), status)| Gateway::new(vehicle, &input.queue, status.map_time.clone()));
+        Gateways::new(gateways, self.stop.subscribe())
     }
 
     fn serve(&mut self, listeners: Listeners, gateways: Gateways) {

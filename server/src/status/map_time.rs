@@ -1,4 +1,4 @@
-//! How long the newest maps took -> how long a map of so many points takes on this machine.
+//! How long the engine worked on the newest maps -> how long a map of so many points takes on this machine.
 
 use std::collections::VecDeque;
 use std::sync::Mutex;
@@ -6,8 +6,7 @@ use std::time::Duration;
 
 use crate::base::sync::locked;
 
-/// Maps that are remembered. The least of their times counts, because a stop of the process or other work on the
-/// machine only adds to it.
+/// Maps that are remembered. The least of their times counts, because other work on the machine only adds to it.
 const MAPS: usize = 4;
 /// Points that take as long as what does not depend on the number of points. Ours: a sixth of a revolution of an
 /// HDL-64E.
@@ -20,16 +19,16 @@ const FIRST_NS: f64 = 100.0;
 pub struct MapTime(Mutex<VecDeque<f64>>);
 
 impl MapTime {
-    /// Remembers that a map of `points` points took so long.
-    pub fn record(&self, points: usize, took: Duration) {
+    /// Remembers that the engine worked on a map of `points` points for so long.
+    pub fn record(&self, points: usize, worked: Duration) {
         let mut newest = locked(&self.0);
         if newest.len() == MAPS {
             newest.pop_front();
         }
-        newest.push_back(took.as_nanos() as f64 / (points + FIXED_POINTS) as f64);
+        newest.push_back(worked.as_nanos() as f64 / (points + FIXED_POINTS) as f64);
     }
 
-    /// How long a map of `points` points takes.
+    /// How long the engine works on a map of `points` points.
     pub fn of(&self, points: usize) -> Duration {
         let least_ns = locked(&self.0).iter().copied().reduce(f64::min).unwrap_or(FIRST_NS);
         Duration::from_nanos((least_ns * points.saturating_add(FIXED_POINTS) as f64) as u64)
