@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 from .errors import ClearwayError
 from .map import Map
 from .signature import PublicKey
+from .standby import Arrivals, Standby
 from .stream import MapStream
 from .tls import Tls
 from .v1 import map_pb2
@@ -153,12 +154,17 @@ def watch(
 ) -> MapStream:
     server = None if signed_by is None else PublicKey(signed_by)
     session = _session(endpoint, tls)
-    stream = MapStream()
-    writer = _StreamWriter(stream, layers)
+    stream, arrivals = MapStream(), Arrivals()
     threads: list[threading.Thread] = []
+
+    def subscribe(session: zenoh.Session, arrivals: Arrivals) -> list[threading.Thread]:
+        writer = _StreamWriter(stream, layers, arrivals)
+        keys = [_LayerKey(vehicle, layer, server) for layer in writer.layers]
+        return [thread for key in keys for thread in _LayerSubscription(session, key, writer).threads]
 
     def close() -> None:
         atexit.unregister(close)
+        arrivals.end()
         session.close()
         # The garbage collector may call this from one of them.
         for thread in threads:
@@ -169,8 +175,10 @@ def watch(
     atexit.register(close)
     stream.on_close(close)
     try:
-        for layer in writer.layers:
-            threads += _LayerSubscription(session, _LayerKey(vehicle, layer, server), writer).threads
+        threads += subscribe(session, arrivals)
+        endpoints = endpoint.split(",")
+        if len(endpoints) > 1:
+            threads.append(Standby(session, arrivals, endpoints, lambda one: _session(one, tls), subscribe).thread)
         threads.append(_ReplaySubscription(session, f"clearway/{vehicle}/replay", stream).thread)
     except Exception as error:
         close()
@@ -283,8 +291,9 @@ class _ReplaySubscription:
 class _StreamWriter:
     """Parts of maps from one thread per layer -> a stream."""
 
-    def __init__(self, stream: MapStream, layers: Sequence[str]) -> None:
+    def __init__(self, stream: MapStream, layers: Sequence[str], arrivals: Arrivals) -> None:
         self._stream, self._collector, self._lock = stream, _LayerCollector(layers), threading.Lock()
+        self._arrivals = arrivals
         self.layers = list(dict.fromkeys(layers))
         #: Samples missed of each layer since the last complete map.
         self._missed = dict.fromkeys(self.layers, 0)
@@ -303,6 +312,7 @@ class _StreamWriter:
             return False
         with self._lock:
             for whole in self._collector.add(*part):
+                self._arrivals.add()
                 # A missed map that was queried has arrived, so it is not a skipped one.
                 if self._stream.store(Map(whole), None, lost=max(self._missed.values())):
                     self._missed = dict.fromkeys(self.layers, 0)

@@ -106,6 +106,40 @@ def test_lost_maps_are_counted_and_a_lost_last_map_is_queried(server, endpoint):
         assert asked.try_recv() is None, "there is no query without a reason"
 
 
+@pytest.fixture
+def lone_routers():
+    """Two routers that are not joined, each with its endpoint."""
+    with socket.create_server(("127.0.0.1", 0)) as a, socket.create_server(("127.0.0.1", 0)) as b:
+        endpoints = [f"tcp/127.0.0.1:{chosen.getsockname()[1]}" for chosen in (a, b)]
+    sessions = []
+    for endpoint in endpoints:
+        config = zenoh.Config()
+        for key, value in [("mode", '"router"'), ("listen/endpoints", f'["{endpoint}"]'),
+                           ("scouting/multicast/enabled", "false")]:  # fmt: skip
+            config.insert_json5(key, value)
+        sessions.append(zenoh.open(config))
+    yield list(zip(sessions, endpoints))
+    for session in sessions:
+        session.close()
+
+
+def test_a_reader_that_knows_two_routers_reads_through_the_second_while_the_first_has_no_maps(lone_routers):
+    (first, near), (second, far) = lone_routers
+    layers = ["drivability", "terrain"]
+    publishers = [published(second, layer) for layer in layers]
+    for publisher, layer in zip(publishers, layers):
+        publisher.put(part(1, layer))
+    # The session is at the router that answers first, so the other order has the other router.
+    for endpoints in (f"{near},{far}", f"{far},{near}"):
+        with watch(endpoints, *layers) as maps:
+            assert counts(next(maps)) == (1, 0, 0), endpoints
+    # A reader that knows one router waits there.
+    with watch(near) as maps:
+        of_first = published(first)
+        of_first.put(part(2))
+        assert counts(next(maps)) == (2, 0, 0)
+
+
 @pytest.mark.parametrize("ending", ["", "maps.close()", "raise SystemExit(3)"], ids=["end", "close", "exit"])
 def test_a_program_may_end_without_closing_its_stream(server, endpoint, ending):
     publisher = published(server)
