@@ -48,7 +48,8 @@ struct Sensors {
     /// Number of clients that have declared each declared sensor, by its index. One without a client is withdrawn as
     /// soon as the queue has space.
     clients: BTreeMap<u16, usize>,
-    /// Number of points and of rays without a return of each sensor's newest scan, and when it came, ns since the Unix epoch.
+    /// Number of points and of rays without a return of each sensor's newest scan, and when it came, ns since the Unix
+    /// epoch.
     newest_scans: BTreeMap<u16, (usize, i64)>,
 }
 

@@ -263,6 +263,30 @@ mod tests {
     }
 
     #[test]
+    fn an_operator_who_is_limited_to_some_vehicles_or_layers_does_not_reach_the_recorder() {
+        let only = |vehicle: &[&str], layers: &[&str]| Only {
+            vehicles: vehicle.iter().map(|&name| name.to_owned()).collect(),
+            layers: layers.iter().map(|&name| name.to_owned()).collect(),
+        };
+        let operators = ["workshop", "of-car", "of-speed"].map(str::to_owned);
+        let limits = [("of-car", only(&["car"], &[])), ("of-speed", only(&[], &["speed"]))];
+        let access = Access::new(&config::Access {
+            operators: operators.into(),
+            only: limits.into_iter().map(|(name, only)| (name.to_owned(), only)).collect(),
+            ..config::Access::default()
+        });
+        for (path, _) in RPCS.iter().filter(|(path, _)| path.starts_with(RECORDING)) {
+            assert!(access.check(path, &["workshop".into()]).unwrap().may_record(), "{path}");
+            for limited in ["of-car", "of-speed"] {
+                let denied = access.check(path, &[limited.into()]).unwrap_err();
+                assert!(denied.message().contains(limited), "{path}: {}", denied.message());
+            }
+        }
+        assert!(!access.check_path("/live", &["of-car".into()]).unwrap().may_record(), "the page shows no buttons");
+        assert!(access.check("/clearway.v1.MapService/Watch", &["of-car".into()]).is_ok());
+    }
+
+    #[test]
     fn every_call_is_denied_that_is_not_allowed() {
         let config = config::Access {
             readers: vec!["planner".into()],
