@@ -9,7 +9,7 @@
 use std::f32::consts::TAU;
 
 use super::cells::{SIDE, centre_m};
-use super::flood::{Bits, Flood, Stages};
+use super::flood::{Bits, Flood};
 
 /// Number of directions. Ours: those of the ground's estimate.
 const DIRECTIONS: usize = 180;
@@ -32,8 +32,8 @@ struct Edge {
 /// The cells by edge and direction.
 #[derive(Clone)]
 pub struct Directions {
-    /// By edge, from the nearest: the cells nearer than it.
-    near: Stages,
+    /// By edge: the cells nearer than it.
+    near: Vec<Bits>,
     /// By edge and direction: the cells of near ground at the edge.
     inside: Vec<Vec<u32>>,
     /// By edge and direction: word of [`Bits`], and its bits of cells beyond the edge, up to the next one.
@@ -67,11 +67,11 @@ impl Directions {
                 }
             }
         }
-        Self { near: Stages::new(near, SIDE), inside, beyond }
+        Self { near, inside, beyond }
     }
 
     /// By edge, from the nearest: the cells nearer than it.
-    pub fn near(&self) -> &Stages {
+    pub fn near(&self) -> &[Bits] {
         &self.near
     }
 

@@ -6,10 +6,6 @@
 
 use std::ops::Range;
 
-/// Number of cells by which the middle of a narrower disc gets nearer to what stops a wider one. Ours: with one, the
-/// wider disc loses the corners of what it covers.
-const NARROWER_STEPS: usize = 2;
-
 /// Flood fill from the middle of a square grid. It reuses its buffers.
 #[derive(Clone, Debug)]
 pub struct Flood {
@@ -17,8 +13,6 @@ pub struct Flood {
     passable: Bits,
     /// Passable cells of one stage.
     near: Bits,
-    /// Middles of one of the narrower discs.
-    middles: Bits,
     reached: Bits,
     covered: Bits,
 }
@@ -27,21 +21,14 @@ impl Flood {
     /// A flood fill of `width` × `width` cells.
     pub fn new(width: usize) -> Self {
         let bits = Bits::square(width);
-        Self {
-            width,
-            passable: bits.clone(),
-            near: bits.clone(),
-            middles: bits.clone(),
-            reached: bits.clone(),
-            covered: bits,
-        }
+        Self { width, passable: bits.clone(), near: bits.clone(), reached: bits.clone(), covered: bits }
     }
 
     /// Floods the grid with a disc whose radius is `radius` cells around its middle cell. The middle of the disc moves
-    /// over open cells. A cell is reached only over cells of the first of
-    /// the `stages` that contains it.
-    pub fn run(&mut self, open: &Bits, closed: &Bits, radius: usize, stages: &Stages) {
-        let Self { width, passable, near, reached, covered, .. } = self;
+    /// over open cells. `stages` are sets of cells, each within the next: a cell is reached only over cells of the
+    /// first set that contains it.
+    pub fn run(&mut self, open: &Bits, closed: &Bits, radius: usize, stages: &[Bits]) {
+        let Self { width, passable, near, reached, covered } = self;
         passable.clear();
         passable.dilate(closed, radius);
         passable.words.iter_mut().zip(&open.words).for_each(|(passable, open)| *passable = open & !*passable);
@@ -52,7 +39,7 @@ impl Flood {
             reached.set(ix, iy);
         }
         reached.words.iter_mut().zip(&passable.words).for_each(|(reached, passable)| *reached &= passable);
-        for stage in &stages.sets {
+        for stage in stages {
             let words = near.words.iter_mut().zip(&passable.words).zip(&stage.words);
             words.for_each(|((near, passable), stage)| *near = passable & stage);
             reached.flood(near);
@@ -60,28 +47,8 @@ impl Flood {
             words.for_each(|((passable, reached), stage)| *passable &= reached | !stage);
         }
         reached.flood(passable);
-        covered.cover(reached, closed, radius);
-        self.narrow(open, closed, radius, &stages.border);
-    }
-
-    /// Removes covered cells that no narrower disc covers from about the same path: the middle of a wider disc may stop
-    /// before ground that is not open, and its rim reach beyond. So a wider disc never gets to more cells.
-    fn narrow(&mut self, open: &Bits, closed: &Bits, radius: usize, border: &Bits) {
-        let Self { passable, near, middles, reached, covered, .. } = self;
-        middles.copy_from(reached);
-        for radius in (0..radius).rev() {
-            passable.clear();
-            passable.dilate(closed, radius);
-            passable.words.iter_mut().zip(&open.words).for_each(|(passable, open)| *passable = open & !*passable);
-            for _ in 0..NARROWER_STEPS {
-                near.copy_from(middles);
-                middles.dilate(near, 1);
-                let words = middles.words.iter_mut().zip(&near.words).zip(&passable.words).zip(&border.words);
-                words.for_each(|(((middle, before), passable), border)| *middle &= passable & (before | !border));
-            }
-            near.cover(middles, closed, radius);
-            covered.words.iter_mut().zip(&near.words).for_each(|(covered, near)| *covered &= near);
-        }
+        covered.clear();
+        covered.dilate(reached, radius);
     }
 
     /// True if the disc covers the cell somewhere on its path.
@@ -100,29 +67,6 @@ impl Flood {
     }
 }
 
-/// Sets of cells, each within the next, over which a disc moves one after the other.
-#[derive(Clone, Debug)]
-pub struct Stages {
-    sets: Vec<Bits>,
-    /// The cells of a set beside a cell that is not in it.
-    border: Bits,
-}
-
-impl Stages {
-    /// These sets of cells of a grid of `width` × `width` cells.
-    pub fn new(sets: Vec<Bits>, width: usize) -> Self {
-        let (mut border, mut outside, mut beside) = (Bits::square(width), Bits::square(width), Bits::square(width));
-        for set in &sets {
-            outside.words.iter_mut().zip(&set.words).for_each(|(outside, set)| *outside = !set);
-            beside.clear();
-            beside.dilate(&outside, 1);
-            let words = border.words.iter_mut().zip(&beside.words).zip(&set.words);
-            words.for_each(|((border, beside), set)| *border |= beside & set);
-        }
-        Self { sets, border }
-    }
-}
-
 /// A square of bits, one for each cell.
 #[derive(Clone, Debug)]
 pub struct Bits {
@@ -130,15 +74,13 @@ pub struct Bits {
     /// Number of words in a row.
     stride: usize,
     words: Vec<u64>,
-    /// A row, for [`Bits::dilate`].
-    wide: Vec<u64>,
 }
 
 impl Bits {
     /// `width` × `width` bits that are not set.
     pub fn square(width: usize) -> Self {
         let stride = width.div_ceil(64);
-        Self { width, stride, words: vec![0; stride * width], wide: vec![0; stride] }
+        Self { width, stride, words: vec![0; stride * width] }
     }
 
     /// Clears all bits.
@@ -194,21 +136,11 @@ impl Bits {
         }
     }
 
-    /// Replaces the bits by the cells that a disc covers with its middle on these cells. A disc of one cell also covers
-    /// the cells at its sides, unless they are closed: a vehicle is wider than its disc.
-    fn cover(&mut self, middles: &Self, closed: &Self, radius: usize) {
-        self.clear();
-        self.dilate(middles, radius.max(1));
-        if radius == 0 {
-            self.words.iter_mut().zip(&closed.words).for_each(|(covered, closed)| *covered &= !closed);
-        }
-    }
-
     /// Adds each cell within `radius` of a cell of `from`. Bits beyond the last column may be set; they are no cells.
     fn dilate(&mut self, from: &Self, radius: usize) {
         let rows = from.words.len() / from.stride;
         let half_width = |dy: usize| (radius * radius - dy * dy).isqrt();
-        let mut wide = std::mem::take(&mut self.wide);
+        let mut wide = vec![0; from.stride];
         for (iy, row) in from.words.chunks_exact(from.stride).enumerate() {
             if row.iter().all(|word| *word == 0) {
                 continue;
@@ -225,7 +157,6 @@ impl Bits {
                 dilate_by_one(&mut wide);
             }
         }
-        self.wide = wide;
     }
 
     /// Spreads set bits to neighbours along sides of cells as long as they are set in `open`.
@@ -316,7 +247,7 @@ mod tests {
         let width = picture.len();
         let is = |c: u8| bits(width, |cell| picture[cell / width].as_bytes()[cell % width] == c);
         let mut flood = Flood::new(width);
-        flood.run(&is(b'.'), &is(b'#'), radius, &Stages::new(Vec::new(), width));
+        flood.run(&is(b'.'), &is(b'#'), radius, &[]);
         let drawn = |(iy, row): (usize, &&str)| {
             let cell = |(ix, c): (usize, char)| if c == '.' && flood.is_reached(ix, iy) { 'o' } else { c };
             row.chars().enumerate().map(cell).collect()
@@ -356,7 +287,7 @@ mod tests {
         let gap = |iy: usize| if iy % 8 == 3 { width - 1 } else { 0 };
         let is_closed = |cell: usize| wall(cell / width) && cell % width != gap(cell / width);
         let mut flood = Flood::new(width);
-        flood.run(&bits(width, |cell| !is_closed(cell)), &bits(width, is_closed), 0, &Stages::new(Vec::new(), width));
+        flood.run(&bits(width, |cell| !is_closed(cell)), &bits(width, is_closed), 0, &[]);
         assert!((0..width * width).all(|cell| flood.is_reached(cell % width, cell / width) != is_closed(cell)));
     }
 }
