@@ -6,6 +6,10 @@
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
+/// Bend, in rad, below which the chord is as long as the arc: the difference of two sines has too few digits there, and
+/// none at all on an arc of 1e16 m.
+const BEND_MIN: f64 = 1e-6;
+
 /// One stretch of constant curvature.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Stretch {
@@ -72,9 +76,11 @@ impl Course {
         let index = self.stretches.partition_point(|stretch| stretch.station <= station).max(1) - 1;
         let Stretch { station: start, x, y, heading, curvature } = self.stretches[index];
         let run = station - start;
-        let end = heading + curvature * run;
-        let (dx, dy) = if curvature == 0.0 {
-            (run * heading.cos(), run * heading.sin())
+        let bend = curvature * run;
+        let end = heading + bend;
+        let (dx, dy) = if bend.abs() < BEND_MIN {
+            let middle = heading + bend / 2.0;
+            (run * middle.cos(), run * middle.sin())
         } else {
             ((end.sin() - heading.sin()) / curvature, (heading.cos() - end.cos()) / curvature)
         };
@@ -126,6 +132,15 @@ impl Drive {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_arc_that_hardly_bends_is_as_long_as_a_straight() {
+        for radius_m in [1e3, 1e6, 1e7, 1e12, 1e17, 1e300] {
+            let (x, y, _) = Course::from(1.0, 2.0, 0.3).arc(radius_m, 1e-3).at(0.8, 0.0);
+            let (dx, dy) = (x - 1.0 - 0.8 * 0.3_f64.cos(), y - 2.0 - 0.8 * 0.3_f64.sin());
+            assert!(dx.hypot(dy) < 0.5 / radius_m + 1e-9, "{radius_m} m: off by {dx}, {dy}");
+        }
+    }
 
     #[test]
     fn a_closed_course_is_continuous_and_repeats() {

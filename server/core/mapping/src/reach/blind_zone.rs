@@ -26,17 +26,20 @@ const TALL_M: f32 = 0.5;
 /// change more from map to map.
 const APART: usize = 2;
 
+/// Half the width of the strip ahead and behind in which a step is no edge, metres. Ours: a car stands on it. It is not
+/// the vehicle's own width, so that a wider vehicle has no fewer edges.
+pub const VEHICLE_M: f32 = 1.0;
+
 /// Finds the lines.
 #[derive(Clone)]
 pub struct BlindZone {
-    half_width_m: f32,
     middles_m: [f32; ROWS],
 }
 
 impl BlindZone {
-    /// Around a vehicle of this width.
-    pub fn new(vehicle_width_m: f32) -> Self {
-        Self { half_width_m: vehicle_width_m / 2.0, middles_m: row_middles_m() }
+    /// No lines.
+    pub fn new() -> Self {
+        Self { middles_m: row_middles_m() }
     }
 
     /// Calls `mark` with column and row of each cell on a line. `obstacle_m` is the height of the obstacle in a cell,
@@ -60,17 +63,13 @@ impl BlindZone {
 
     /// Left and right, behind and ahead: the cell beside a step that is least far behind or ahead.
     fn nearest(&self, beside_step: &Bits, obstacle_m: impl Fn(usize) -> f32) -> [[Option<usize>; 2]; 2] {
-        let around = |ix: usize, iy: usize| {
-            let rows = iy - APART..=iy + APART;
-            rows.flat_map(move |iy| (ix - APART..=ix + APART).map(move |ix| iy * SIDE + ix))
-        };
         let mut nearest = [[None; 2]; 2];
         beside_step.each(|ix, iy| {
             let [x, y] = centre_m(iy * SIDE + ix);
-            if y.abs() > self.half_width_m && x * x + y * y < RANGE_M_MAX * RANGE_M_MAX {
+            if y.abs() > VEHICLE_M && x * x + y * y < RANGE_M_MAX * RANGE_M_MAX {
                 let nearest = &mut nearest[usize::from(y < 0.0)][usize::from(x > 0.0)];
                 let is_nearer = nearest.is_none_or(|cell| x.abs() < centre_m(cell)[0].abs());
-                if is_nearer && around(ix, iy).all(|cell| obstacle_m(cell) < TALL_M) {
+                if is_nearer && is_of_ground(ix, iy, &obstacle_m) {
                     *nearest = Some(iy * SIDE + ix);
                 }
             }
@@ -84,6 +83,13 @@ impl BlindZone {
         let nearest = (0..ROWS).find(|row| confidences[row * COLUMNS + column] == Confidence::Seen);
         nearest.is_none_or(|row| self.middles_m[row] >= libm::hypotf(x, y) - MARGIN_M)
     }
+}
+
+/// True if a cell beside a step, which is not at the border of the grid, is one of the ground itself: if no tall
+/// obstacle stands beside it. `obstacle_m` is the height of the obstacle in a cell, negative without one.
+pub fn is_of_ground(ix: usize, iy: usize, obstacle_m: impl Fn(usize) -> f32) -> bool {
+    let mut around = (iy - APART..=iy + APART).flat_map(|iy| (ix - APART..=ix + APART).map(move |ix| iy * SIDE + ix));
+    around.all(|cell| obstacle_m(cell) < TALL_M)
 }
 
 #[cfg(test)]
@@ -105,7 +111,7 @@ mod tests {
         let mut confidences = vec![Confidence::Bridged; CELLS];
         confidences[PolarIndex::at(seen[0], seen[1]).index().unwrap()] = Confidence::Seen;
         let mut marked = 0;
-        BlindZone::new(2.0).find(&beside_step, obstacle_m, &confidences, |_, _| marked += 1);
+        BlindZone::new().find(&beside_step, obstacle_m, &confidences, |_, _| marked += 1);
         marked
     }
 

@@ -10,8 +10,10 @@
 //! |---|---|
 //! | points -> cells with an obstacle | `obstacles` |
 //! | points -> cells beside a step of the ground | `steps` |
-//! | cells beside a step -> those between two of them | `joins` |
+//! | points -> cells in a trough of the ground | `troughs` |
+//! | cells beside a step or in a trough -> those between two of them | `joins` |
 //! | cells beside a step ahead and behind -> those between them, beside the vehicle | `blind_zone` |
+//! | cells beside a step near the vehicle -> those on straight continuations of their line | `edges` |
 //! | obstacles -> the ground that they hide | `shadow` |
 //! | open and closed cells -> reached cells | `flood` |
 //! | reached cells -> those without a detour over farther ground | `directions` |
@@ -20,26 +22,31 @@ mod blind_zone;
 mod cells;
 pub mod config;
 mod directions;
+mod edges;
 mod flood;
 mod joins;
 mod obstacles;
 mod shadow;
 mod steps;
+mod troughs;
 
 use crate::ground::Ground;
 use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
 use crate::ground::surface::Confidence;
 use crate::sensor::sweep::Sweep;
+use crate::vehicle_outline::Outline;
 
 use blind_zone::BlindZone;
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
 use directions::Directions;
+use edges::Edges;
 use flood::{Bits, Flood};
 use joins::Joins;
 use obstacles::Obstacles;
 use shadow::Shadow;
 use steps::Steps;
+use troughs::Troughs;
 
 /// Number of cells of a word of bits.
 const WORD: usize = 64;
@@ -47,6 +54,9 @@ const WORD: usize = 64;
 const CHUNK: usize = 1024;
 /// Least height that an obstacle's returns span if it casts a shadow, metres. Ours: kerbs cast none; not tuned.
 const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
+
+/// Greatest width of the strip under the vehicle that is open without a return, metres. Ours: narrower than a car.
+const STRIP_M: f32 = 1.0;
 
 /// Whether unseen ground of a polar cell counts as free of obstacles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -88,6 +98,7 @@ pub struct Reach {
     under_vehicle: Vec<usize>,
     obstacles: Obstacles,
     steps: Steps,
+    troughs: Troughs,
     shadow: Shadow,
     /// True by polar cell if an obstacle stands in it.
     has_obstacle: Vec<bool>,
@@ -97,7 +108,8 @@ pub struct Reach {
     closed: Bits,
     joins: Joins,
     blind_zone: BlindZone,
-    /// Closed cells, and those between two cells beside a step.
+    edges: Edges,
+    /// Closed cells, those between two cells beside a step, and those on the continuation of an edge.
     barred: Bits,
     directions: Directions,
     flood: Flood,
@@ -106,7 +118,8 @@ pub struct Reach {
 impl Reach {
     /// A maker with validated parameters.
     pub fn new(config: &ReachConfig) -> Self {
-        let outline = config.outline();
+        // A wider vehicle shall not be given more ground to move over.
+        let outline = Outline { width_m: config.vehicle_width_m.min(STRIP_M), ..config.outline() };
         let centres_m = (0..SIDE * SIDE).map(|cell| (cell, cells::centre_m(cell)));
         let bits = Bits::square(SIDE);
         Self {
@@ -115,13 +128,15 @@ impl Reach {
             under_vehicle: centres_m.filter(|(_, [x, y])| outline.contains(*x, *y)).map(|(cell, _)| cell).collect(),
             obstacles: Obstacles::new(),
             steps: Steps::new(),
+            troughs: Troughs::new(),
             shadow: Shadow::new((0..SIDE * SIDE).map(cells::centre_m)),
             has_obstacle: vec![false; CELLS],
             views: vec![View::Closed; CELLS],
             open: bits.clone(),
             closed: bits.clone(),
             joins: Joins::new(),
-            blind_zone: BlindZone::new(config.vehicle_width_m),
+            blind_zone: BlindZone::new(),
+            edges: Edges::new(),
             barred: bits,
             directions: Directions::new(),
             flood: Flood::new(SIDE),
@@ -139,11 +154,16 @@ impl Reach {
         self.closed.clear();
         let closed = &mut self.closed;
         self.steps.find(&self.config, |cell| closed.set(cell % SIDE, cell / SIDE));
+        let steps = &self.steps;
+        self.troughs.find(steps.seen(), |cell| steps.low_mm(cell), |ix, iy| closed.set(ix, iy));
         self.barred.copy_from(closed);
         let barred = &mut self.barred;
         self.joins.find(closed, &self.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
         let obstacle_m = |cell| self.obstacles.height_m(cell);
         self.blind_zone.find(closed, obstacle_m, ground.confidences(), |ix, iy| barred.set(ix, iy));
+        let ground_m =
+            |cell| Some(steps.low_mm(cell)).filter(|low| *low != i16::MAX).map(|low| f32::from(low) / 1000.0);
+        self.edges.find(closed, &self.obstacles, ground_m, |ix, iy| barred.set(ix, iy));
         for (cell, _) in self.obstacles.cells() {
             closed.set(cell % SIDE, cell / SIDE);
             barred.set(cell % SIDE, cell / SIDE);

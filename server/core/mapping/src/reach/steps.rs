@@ -79,6 +79,11 @@ impl Steps {
         }
     }
 
+    /// Height of the lowest return from the ground of a cell, millimetres; the largest number without one.
+    pub fn low_mm(&self, cell: usize) -> i16 {
+        self.spans[cell][0]
+    }
+
     /// Indices of the cells with a return from the ground.
     pub fn seen(&self) -> impl Iterator<Item = usize> {
         self.seen.iter().map(|cell| *cell as usize)
