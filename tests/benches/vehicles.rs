@@ -2,7 +2,7 @@
 //! reader of `drivability` and `speed` for each vehicle.
 //!
 //!   cargo bench -p clearway-tests --bench vehicles                                1, 2, 4, 8 and 16 vehicles
-//!   cargo bench -p clearway-tests --bench vehicles -- --vehicles 4 --seconds 60 --cpus 0,1
+//!   cargo bench -p clearway-tests --bench vehicles -- --vehicles 4 --seconds 60 --cpus 0,1 --json
 //!
 //! The server runs in its own process, on the processors of `--cpus`; senders and readers run on the others. The
 //! datagrams are made beforehand, and every vehicle sends the same ones, each begun at another moment of a revolution.
@@ -26,6 +26,7 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::vehicle::{Datagram, SimulatedVehicle};
 use clearway_tests::packets::{REVOLUTION, later, packets, send};
+use serde_json::{Value, json};
 use tokio::task::JoinSet;
 
 /// Time after which readers are connected and memory is allocated; maps until then are not counted.
@@ -48,6 +49,9 @@ struct Arguments {
     /// Processors of the server.
     #[arg(long, default_value = "0,1")]
     cpus: String,
+    /// Prints one JSON object instead of a table.
+    #[arg(long)]
+    json: bool,
     /// Runs as the server of so many vehicles; this program starts itself so.
     #[arg(long, hide = true)]
     serve: Option<usize>,
@@ -66,18 +70,47 @@ fn main() {
     let length = SETTLE + Duration::from_secs(arguments.seconds) + 2 * REVOLUTION;
     let vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
     let drive: Arc<[Datagram]> = packets(vehicle, length).into();
+    let mut rows = Vec::new();
+    if !arguments.json {
+        print_header();
+    }
+    for &vehicles in &arguments.vehicles {
+        let row = runtime.block_on(measure(vehicles, &arguments, &drive));
+        if !arguments.json {
+            print_row(&row);
+        }
+        rows.push(row);
+    }
+    if arguments.json {
+        println!("{}", json!({ "rows": rows }));
+    }
+}
+
+fn print_header() {
     println!(
         "| vehicles | maps/s | age p50 / p99 / worst ms | maps missed | datagrams lost | MiB a vehicle | server's cores \
          | ms a map: engine / UDP / all else |"
     );
     println!("|---|---|---|---|---|---|---|---|");
-    for &vehicles in &arguments.vehicles {
-        println!("{}", runtime.block_on(measure(vehicles, &arguments, &drive)));
-    }
+}
+
+fn print_row(row: &Value) {
+    let number = |value: &Value| value.as_f64().unwrap_or(f64::NAN);
+    let [p50, p99, worst] = [0, 1, 2].map(|at| number(&row["age_ms"][at]));
+    let [engine, udp, other] = ["engine", "udp", "other"].map(|group| number(&row["ms_per_map"][group]));
+    println!(
+        "| {} | {:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {} | {} | {:.0} | {:.2} | {engine:.1} / {udp:.1} / {other:.1} |",
+        row["vehicles"],
+        number(&row["maps_per_s"]),
+        row["missed"],
+        row["lost"],
+        number(&row["mib_per_vehicle"]),
+        number(&row["server_cores"]),
+    );
 }
 
 /// Runs one row.
-async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>) -> String {
+async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>) -> Value {
     let mut server = Process::start(vehicles, &arguments.cpus);
     let client = Client::connect(&server.grpc).await.expect("the server answers");
     let empty_kib = server.resident_kib();
@@ -126,16 +159,20 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
     }
     ages.sort_by(f64::total_cmp);
     let at = |share: f64| ages.get(((ages.len() as f64 * share) as usize).min(ages.len().max(1) - 1)).copied();
-    let [p50, p99, worst] = [0.5, 0.99, 1.0].map(|share| at(share).unwrap_or(f64::NAN));
+    // Median, 99th percentile, worst.
+    let ages_ms = [0.5, 0.99, 1.0].map(at);
     let rate = ages.len() as f64 / arguments.seconds as f64;
-    let mib = (kib - empty_kib) as f64 / 1024.0 / vehicles as f64;
-    let lost = sent.load(Ordering::Relaxed).saturating_sub(received);
-    let cores = spent_s.iter().sum::<f64>() / seconds;
     let [engine, udp, other] = spent_s.map(|spent_s| 1e3 * spent_s / seconds / rate);
-    format!(
-        "| {vehicles} | {rate:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {missed} | {lost} | {mib:.0} | {cores:.2} \
-         | {engine:.1} / {udp:.1} / {other:.1} |"
-    )
+    json!({
+        "vehicles": vehicles,
+        "maps_per_s": rate,
+        "age_ms": ages_ms,
+        "missed": missed,
+        "lost": sent.load(Ordering::Relaxed).saturating_sub(received),
+        "mib_per_vehicle": (kib - empty_kib) as f64 / 1024.0 / vehicles as f64,
+        "server_cores": spent_s.iter().sum::<f64>() / seconds,
+        "ms_per_map": { "engine": engine, "udp": udp, "other": other },
+    })
 }
 
 fn name(number: usize) -> String {

@@ -22,8 +22,6 @@ The packages are installed into an environment below --venv, which is made at th
 """
 
 import argparse
-import csv
-import json
 import os
 import random
 import statistics
@@ -34,6 +32,7 @@ import time
 from pathlib import Path
 
 import environment
+from environment import REPOSITORY
 
 PACKAGES = [
     "pypatchworkpp==1.4.1",
@@ -43,7 +42,6 @@ PACKAGES = [
     "numpy",
     "matplotlib",
 ]
-REPOSITORY = Path(__file__).resolve().parents[2]
 # Rounds before the first that counts: buffers get their sizes.
 WARM_UP = 6
 # Shares of the points of a scan, for the plot of cost against points.
@@ -56,16 +54,10 @@ DECODE_TARGET = 5
 
 def build():
     """The built program `stages` and the command `clearway`."""
-    def executable(arguments, name):
-        command = ["cargo", *arguments, "--message-format=json"]
-        messages = subprocess.run(command, cwd=REPOSITORY, check=True, stdout=subprocess.PIPE, text=True).stdout
-        built = [json.loads(line) for line in messages.splitlines()]
-        return next(m["executable"] for m in built if m.get("executable") and m["target"]["name"] == name)
-
-    tests = ["build", "--release", "-p", "clearway-tests", "--no-default-features"]
-    stages = executable([*tests, "--bin", "stages"], "stages")
-    command = executable(["build", "--release", "-p", "clearway", "--no-default-features", "-F", "sim"], "clearway")
-    return stages, command
+    release = ["build", "--release", "--no-default-features", "-p"]
+    stages = environment.build(*release, "clearway-tests", "--bin", "stages")
+    command = environment.build(*release, "clearway", "-F", "sim")
+    return stages["stages"], command["clearway"]
 
 
 class Clearway:
@@ -175,13 +167,6 @@ def summarise(rows):
     return summary
 
 
-def write_csv(file, header, rows):
-    with open(file, "w", newline="") as written:
-        writer = csv.writer(written)
-        writer.writerow(header)
-        writer.writerows(rows)
-
-
 def draw(summary, out):
     """ratios.png: each program on the whole scans. points.png: cost against the number of points."""
     import matplotlib
@@ -260,8 +245,8 @@ def main():
     os.dup2(table, 1)
     options.out.mkdir(parents=True, exist_ok=True)
     summary = summarise(rows)
-    write_csv(options.out / "times.csv", ["scan", "points", "program", "round", "milliseconds"], rows)
-    write_csv(options.out / "ratios.csv", ["scan", "points", "program", "median_ms", "ratio"], summary)
+    environment.write_csv(options.out / "times.csv", ["scan", "points", "program", "round", "milliseconds"], rows)
+    environment.write_csv(options.out / "ratios.csv", ["scan", "points", "program", "median_ms", "ratio"], summary)
     draw(summary, options.out)
     show(summary)
     print(f"\n{options.out}/times.csv, ratios.csv, ratios.png, points.png")

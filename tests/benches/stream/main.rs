@@ -4,12 +4,13 @@
 //!
 //!   cargo bench -p clearway-tests --bench stream                                  1, 10, 100 and 1,000 readers
 //!   cargo bench -p clearway-tests --bench stream -- --readers 1,10 --seconds 30 --layer occupancy --json
+//!   cargo bench -p clearway-tests --bench stream -- --readers 300 --carriers grpc
 //!   cargo bench -p clearway-tests --bench stream -- --slow --seconds 60           what slow readers cost the others
 //!
 //! Age: time from sending the last packet of a revolution to receiving its map. Carried: time from the server's
 //! hand-over to the transport to receiving the map. The first reader decodes every map, as a planner does; the others
 //! receive the bytes, and acknowledge them over gRPC and to the page. Memory: growth of the server's resident set,
-//! divided by the number of readers. All processes use the clock of one machine.
+//! divided by the number of readers. Cores: processor time of the server over the time that is measured. All processes use the clock of one machine.
 
 mod drive;
 mod server;
@@ -21,7 +22,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
-use clap::Parser;
+use clap::{Parser, ValueEnum};
 use clearway_client::{MapView, now_ns, v1};
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use futures::{SinkExt, StreamExt};
@@ -54,6 +55,9 @@ struct Arguments {
     /// Layer that is read.
     #[arg(long, default_value = "drivability")]
     layer: String,
+    /// Transports of the maps, one row each.
+    #[arg(long, value_enum, value_delimiter = ',', default_values_t = Carrier::value_variants().to_vec())]
+    carriers: Vec<Carrier>,
     /// Measures instead what a stopped and a slow reader cost eight others, and the age of the first map after
     /// resuming.
     #[arg(long)]
@@ -69,13 +73,13 @@ struct Arguments {
     bench: bool,
 }
 
-/// Transport of the maps.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Transport of the maps. TCP is last, with as many bytes as a map of the row before has.
+#[derive(Clone, Copy, Debug, PartialEq, ValueEnum)]
 enum Carrier {
-    Tcp,
     Grpc,
     Zenoh,
     Page,
+    Tcp,
 }
 
 /// Measurements of all readers together.
@@ -117,7 +121,7 @@ fn main() -> ExitCode {
     let mut rows = Vec::new();
     if !arguments.json {
         println!(
-            "{:<6} {:>7} {:>22} {:>22} {:>22} {:>9} {:>10} {:>11}",
+            "{:<6} {:>7} {:>22} {:>22} {:>22} {:>9} {:>10} {:>11} {:>6}",
             "",
             "readers",
             "age p50/p99 ms",
@@ -125,13 +129,13 @@ fn main() -> ExitCode {
             "carried p50/p99 ms",
             "maps/s",
             "bytes/map",
-            "KiB/reader"
+            "KiB/reader",
+            "cores"
         );
     }
     for &readers in &arguments.readers {
         let mut bytes = 10_000;
-        // TCP is last, with as many bytes as a map has.
-        for carrier in [Carrier::Grpc, Carrier::Zenoh, Carrier::Page, Carrier::Tcp] {
+        for &carrier in &arguments.carriers {
             let row = runtime.block_on(measure(&arguments, &revolutions, carrier, readers, bytes));
             bytes = row["bytes_per_map"].as_u64().unwrap_or(bytes);
             if !arguments.json {
@@ -159,7 +163,7 @@ fn print_row(row: &serde_json::Value) {
         None => "-".into(),
     };
     println!(
-        "{:<6} {:>7} {:>22} {:>22} {:>22} {:>9.0} {:>10} {:>11.1}",
+        "{:<6} {:>7} {:>22} {:>22} {:>22} {:>9.0} {:>10} {:>11.1} {:>6.2}",
         row["carrier"].as_str().unwrap_or_default(),
         row["readers"],
         pair("age_ms"),
@@ -168,6 +172,7 @@ fn print_row(row: &serde_json::Value) {
         row["maps_per_s"].as_f64().unwrap_or_default(),
         row["bytes_per_map"],
         row["kib_per_reader"].as_f64().unwrap_or_default(),
+        row["server_cores"].as_f64().unwrap_or_default(),
     );
 }
 
@@ -189,7 +194,9 @@ async fn measure(
     let alone_kib = server.resident_kib();
     readers.join(&mut tasks, &server, carrier, &arguments.layer, count - 1, bytes).await;
     tokio::time::sleep(SETTLE).await;
+    let before_s = server.processor_s();
     readers.count_for(Duration::from_secs(arguments.seconds)).await;
+    let spent_s = server.processor_s() - before_s;
     let grown_kib = server.resident_kib() - alone_kib;
     car.stop();
     tasks.shutdown().await;
@@ -205,6 +212,7 @@ async fn measure(
         "carried_ms": percentiles(&mut seen.carried),
         "maps_per_s": maps as f64 / arguments.seconds as f64,
         "bytes_per_map": seen.bytes.checked_div(maps),
+        "server_cores": spent_s / arguments.seconds as f64,
         "kib_per_reader": if count > 1 { grown_kib as f64 / (count - 1) as f64 } else { 0.0 },
     })
 }

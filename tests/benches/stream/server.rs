@@ -10,6 +10,7 @@ use clearway::config::{Config, Udp};
 use clearway::server::{Server, Setup};
 use clearway_client::now_ns;
 use clearway_sim::scanner::ScannerConfig;
+use clearway_tests::siege::watch::processor_s;
 use tokio::io::AsyncReadExt;
 
 /// Most browsers of a row.
@@ -43,6 +44,11 @@ impl Process {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("Linux");
         let line = status.lines().find(|line| line.starts_with("VmRSS")).expect("VmRSS");
         line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
+    }
+
+    /// Processor time of the process so far, in seconds.
+    pub fn processor_s(&self) -> f64 {
+        processor_s(self.child.id())
     }
 
     /// Ends the process by the end of its standard input.
