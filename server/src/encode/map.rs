@@ -199,9 +199,9 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         speed_mps: map.speed_mps,
         sensors: map.present_sensors().map(sensor).collect(),
         compensation: map.compensation.as_str().to_owned(),
-        source_sensor: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
+        source_sensor: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.to_string()),
         reference_sensor: (map.sensors.get(usize::from(map.reference_sensor)))
-            .map_or(String::new(), |sensor| sensor.name.clone()),
+            .map_or(String::new(), |sensor| sensor.name.to_string()),
         epoch: map.epoch,
         replay: None,
     }
@@ -216,8 +216,8 @@ pub(super) fn pose(isometry: &Isometry3<f64>) -> v1::Pose {
 /// A sensor's state on the wire.
 pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
     v1::SensorState {
-        name: state.name.clone(),
-        model: state.model.clone(),
+        name: state.name.to_string(),
+        model: state.model.to_owned(),
         packets: state.packets,
         refused: state.refused,
         returns: state.returns,

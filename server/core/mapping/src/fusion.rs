@@ -322,7 +322,7 @@ impl Fusion {
         since_ns.saturating_abs() > self.deadline_ns
     }
 
-    fn merge_scans(&mut self, own: OwnScan, scans: &[SensorScan], motion: &Motion, now: EventTime) -> MergedScans {
+    fn merge_scans(&mut self, mut own: OwnScan, scans: &[SensorScan], motion: &Motion, now: EventTime) -> MergedScans {
         let (source, stamp_ns) = (own.source, own.end_ns);
         let mut merged = MergedScans {
             source,
@@ -335,7 +335,7 @@ impl Fusion {
         };
         for (index, scan) in scans.iter().enumerate() {
             if index == source {
-                merged.sensors.push(SensorState { age_ms: Some(0.0), ..own.state.clone() });
+                merged.sensors.push(SensorState { age_ms: Some(0.0), ..std::mem::take(&mut own.state) });
                 continue;
             }
             let contribution = self.contribution(scan, stamp_ns, now);
@@ -386,7 +386,7 @@ fn sensor_state(scan: &SensorScan, contribution: Contribution, stamp_ns: i64) ->
     let counts = if contribution.is_in_map() { scan.state.clone() } else { SensorState::default() };
     SensorState {
         name: scan.state.name.clone(),
-        model: scan.state.model.clone(),
+        model: scan.state.model,
         contribution,
         clock: scan.state.clock,
         clock_offset_ms: scan.state.clock_offset_ms,

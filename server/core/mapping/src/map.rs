@@ -1,6 +1,8 @@
 //! What a map is: a header, the state of every sensor, and layers. Class 0 of every layer means unknown; an unknown
 //! cell is never free.
 
+use std::sync::Arc;
+
 use clearway_lidar::Blocked;
 use nalgebra::Isometry3;
 
@@ -49,9 +51,9 @@ impl Map {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SensorState {
     /// Name of the sensor in the configuration.
-    pub name: String,
+    pub name: Arc<str>,
     /// Name of the model (`hdl32e`, and so on); `scan` if the sensor sends scans.
-    pub model: String,
+    pub model: &'static str,
     /// Number of data packets of the revolution; 0 for scans.
     pub packets: u32,
     /// Number of data packets of the revolution and of those that are missing before them, ±1 a gap; 0 for scans.

@@ -36,6 +36,8 @@ use surface::{Confidence, Surface};
 pub struct Ground {
     cells: PolarCells,
     plane: NearPlane,
+    /// Row and column of the seen cells near the vehicle; a buffer.
+    near: Vec<(usize, usize)>,
     growth: Growth,
     surface: Surface,
     /// Heights of the surface's nodes with one more column at each end, so that a look-up needs no wrapping; the first
@@ -68,6 +70,7 @@ impl Ground {
         Self {
             cells: PolarCells::new(outline),
             plane: NearPlane::default(),
+            near: Vec::new(),
             growth: Growth::default(),
             surface: Surface::default(),
             nodes: Vec::new(),
@@ -78,7 +81,7 @@ impl Ground {
     /// Estimates the ground from the points of a sweep.
     pub fn estimate(&mut self, sweep: &Sweep) {
         self.cells.sort_points(sweep);
-        self.plane = NearPlane::fit(&self.cells);
+        self.plane = NearPlane::fit(&self.cells, &mut self.near);
         self.growth.grow(&self.cells, &self.plane);
         self.surface.cover(&self.growth, &self.plane);
         self.write_nodes();

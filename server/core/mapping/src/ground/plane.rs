@@ -44,18 +44,17 @@ impl NearPlane {
         a * x + b * y + c
     }
 
-    /// Fits the plane; the plane z = 0 if too few returns lie near one.
-    pub fn fit(cells: &PolarCells) -> Self {
+    /// Fits the plane; the plane z = 0 if too few returns lie near one. `near` is a buffer.
+    pub fn fit(cells: &PolarCells, near: &mut Vec<(usize, usize)>) -> Self {
         let directions = column_directions();
         let rows = (0..ROWS).take_while(|row| row_start_m(*row) < RANGE_M_MAX).count();
-        let near: Vec<(usize, usize)> = (0..rows)
-            .flat_map(|row| (0..COLUMNS).map(move |column| (row, column)))
-            .filter(|(row, column)| cells.is_seen(row * COLUMNS + column))
-            .collect();
+        near.clear();
+        let all = (0..rows).flat_map(|row| (0..COLUMNS).map(move |column| (row, column)));
+        near.extend(all.filter(|(row, column)| cells.is_seen(row * COLUMNS + column)));
         let mut plane = Self::default();
         for [above, below, a_metre] in TOLERANCES {
             let mut sums = Sums::default();
-            for &(row, column) in &near {
+            for &(row, column) in near.iter() {
                 let [cos, sin] = directions[column];
                 let found = cells.lowest(row * COLUMNS + column).find_map(|point| {
                     let (x, y) = (point.range_m * cos, point.range_m * sin);

@@ -15,22 +15,31 @@ pub struct Flood {
     near: Bits,
     reached: Bits,
     covered: Bits,
+    /// One row, as wide as the disc makes it so far; a buffer.
+    wide: Vec<u64>,
 }
 
 impl Flood {
     /// A flood fill of `width` × `width` cells.
     pub fn new(width: usize) -> Self {
         let bits = Bits::square(width);
-        Self { width, passable: bits.clone(), near: bits.clone(), reached: bits.clone(), covered: bits }
+        Self {
+            width,
+            passable: bits.clone(),
+            near: bits.clone(),
+            reached: bits.clone(),
+            covered: bits,
+            wide: Vec::new(),
+        }
     }
 
     /// Floods the grid with a disc whose radius is `radius` cells around its middle cell. The middle of the disc moves
     /// over open cells. `stages` are sets of cells, each within the next: a cell is reached only over cells of the
     /// first set that contains it.
     pub fn run(&mut self, open: &Bits, closed: &Bits, radius: usize, stages: &[Bits]) {
-        let Self { width, passable, near, reached, covered } = self;
+        let Self { width, passable, near, reached, covered, wide } = self;
         passable.clear();
-        passable.dilate(closed, radius);
+        passable.dilate(closed, radius, wide);
         passable.words.iter_mut().zip(&open.words).for_each(|(passable, open)| *passable = open & !*passable);
         reached.clear();
         // The vehicle stands between the four middle cells.
@@ -48,7 +57,7 @@ impl Flood {
         }
         reached.flood(passable);
         covered.clear();
-        covered.dilate(reached, radius);
+        covered.dilate(reached, radius, wide);
     }
 
     /// True if the disc covers the cell somewhere on its path.
@@ -137,10 +146,11 @@ impl Bits {
     }
 
     /// Adds each cell within `radius` of a cell of `from`. Bits beyond the last column may be set; they are no cells.
-    fn dilate(&mut self, from: &Self, radius: usize) {
+    /// `wide` is a buffer.
+    fn dilate(&mut self, from: &Self, radius: usize, wide: &mut Vec<u64>) {
         let rows = from.words.len() / from.stride;
         let half_width = |dy: usize| (radius * radius - dy * dy).isqrt();
-        let mut wide = vec![0; from.stride];
+        wide.resize(from.stride, 0);
         for (iy, row) in from.words.chunks_exact(from.stride).enumerate() {
             if row.iter().all(|word| *word == 0) {
                 continue;
@@ -151,10 +161,10 @@ impl Bits {
                     for other in [iy.checked_sub(dy), Some(iy + dy)].into_iter().flatten().filter(|other| *other < rows)
                     {
                         let row = &mut self.words[other * from.stride..][..from.stride];
-                        row.iter_mut().zip(&wide).for_each(|(word, wide)| *word |= wide);
+                        row.iter_mut().zip(&*wide).for_each(|(word, wide)| *word |= wide);
                     }
                 }
-                dilate_by_one(&mut wide);
+                dilate_by_one(wide);
             }
         }
     }

@@ -44,7 +44,7 @@ const RANGE_NOISE_M: f32 = 0.02;
 /// One sensor of the vehicle.
 #[derive(Clone)]
 pub(crate) struct SensorPipeline {
-    name: String,
+    name: Arc<str>,
     decoder: Sensor,
     mount: Mount,
     filter: Option<SelfFilter>,
@@ -98,7 +98,7 @@ impl SensorPipeline {
         let (scan_calibration, scan_elevations) = scan_calibration(config, calibration.as_ref());
         let mount = Mount { ego_from_sensor: config.extrinsics.ego_from_sensor(), range_m_min: config.range_m_min };
         Self {
-            name: config.name.clone(),
+            name: config.name.as_str().into(),
             scan_calibration: scan_calibration.map(Arc::new),
             scan_elevations,
             elevations: None,
@@ -332,10 +332,15 @@ fn revolution_elevations(source: CalibrationSource, model: Model) -> ElevationSo
 }
 
 /// What a map states about the sensor of a revolution.
-fn revolution_state(name: &str, revolution: &Revolution, elevations: ElevationSource, returns: u32) -> SensorState {
+fn revolution_state(
+    name: &Arc<str>,
+    revolution: &Revolution,
+    elevations: ElevationSource,
+    returns: u32,
+) -> SensorState {
     SensorState {
-        name: name.to_owned(),
-        model: revolution.model.as_str().to_owned(),
+        name: name.clone(),
+        model: revolution.model.as_str(),
         packets: revolution.packets,
         packets_expected: revolution.packets_expected,
         refused: 0,
@@ -354,10 +359,10 @@ fn revolution_state(name: &str, revolution: &Revolution, elevations: ElevationSo
 }
 
 /// What a map states about the sensor of a scan event.
-fn scan_state(name: &str, scan: &Scan, elevations: ElevationSource, returns: u32, now: EventTime) -> SensorState {
+fn scan_state(name: &Arc<str>, scan: &Scan, elevations: ElevationSource, returns: u32, now: EventTime) -> SensorState {
     SensorState {
-        name: name.to_owned(),
-        model: "scan".to_owned(),
+        name: name.clone(),
+        model: "scan",
         returns,
         // The sender alone can tell which part of its field of view is missing.
         completeness: 1.0,

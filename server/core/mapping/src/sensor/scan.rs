@@ -49,7 +49,7 @@ impl SensorScan {
         Self {
             origin_m,
             tilt_rad,
-            state: SensorState { name: name.to_owned(), ..SensorState::default() },
+            state: SensorState { name: name.into(), ..SensorState::default() },
             ..Self::default()
         }
     }

@@ -75,7 +75,7 @@ fn an_invalid_declaration_is_refused_and_a_valid_one_adds_a_sensor() {
     assert_eq!((pipeline.ledger().sensors, pipeline.ledger().sensors_refused), (2, 7));
     assert_eq!(pipeline.step(&rear), Ok(None));
     let map = step(&mut pipeline, &scan(0, 20 * MS)).unwrap();
-    assert_eq!((map.sensors[3].name.as_str(), map.sensors[3].contribution), ("rear", Contribution::Ok));
+    assert_eq!((&*map.sensors[3].name, map.sensors[3].contribution), ("rear", Contribution::Ok));
     assert!((pipeline.newest_sweep().x[2] + 6.0).abs() < 1e-5, "5 m behind the rear sensor");
     assert_eq!(pipeline.sensors().len(), 4);
 }
@@ -106,7 +106,7 @@ fn nothing_is_known_of_a_withdrawn_sensor_and_its_name_and_index_are_free() {
         assert_eq!(pipeline.step(&reading), Err(EventError::Source { source_index: 3, sensors: 4 }));
     }
     let map = step(&mut pipeline, &scan(0, 120 * MS)).unwrap();
-    let present: Vec<_> = map.present_sensors().map(|sensor| sensor.name.as_str()).collect();
+    let present: Vec<_> = map.present_sensors().map(|sensor| &*sensor.name).collect();
     assert_eq!((present.len(), present.contains(&"rear"), present.contains(&"trailer")), (4, false, true));
     let without = pipeline.newest_sweep().x.len();
 
@@ -118,7 +118,7 @@ fn nothing_is_known_of_a_withdrawn_sensor_and_its_name_and_index_are_free() {
     pipeline.step(&scan(3, 210 * MS)).unwrap();
     pipeline.step(&scan(4, 210 * MS)).unwrap();
     let map = step(&mut pipeline, &scan(0, 220 * MS)).unwrap();
-    assert_eq!((map.sensors[3].name.as_str(), map.sensors[3].contribution), ("rear", Contribution::Ok));
+    assert_eq!((&*map.sensors[3].name, map.sensors[3].contribution), ("rear", Contribution::Ok));
     assert!(pipeline.newest_sweep().x.len() > without);
 
     for source in [4, 3] {

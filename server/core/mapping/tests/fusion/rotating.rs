@@ -93,7 +93,7 @@ fn two_rotating_sensors_have_a_decoder_and_a_ledger_each() {
     let (made, pipeline) = run(&events);
     assert!(made.len() >= 3 && made.iter().all(|map| map.source == 0));
     let last = made.last().unwrap();
-    let contributing: Vec<_> = last.sensors.iter().map(|s| (s.model.as_str(), s.contribution, s.packets > 0)).collect();
+    let contributing: Vec<_> = last.sensors.iter().map(|s| (s.model, s.contribution, s.packets > 0)).collect();
     assert_eq!(
         contributing,
         [("vlp16", Contribution::Ok, true), ("hdl32e", Contribution::Ok, true), ("scan", Contribution::Ok, false)]

@@ -99,6 +99,7 @@ impl MountCheck {
         if self.deviations.len() == SCANS_MAX {
             self.deviations.pop_front();
         }
+        self.deviations.reserve(SCANS_MAX - self.deviations.len());
         self.deviations.push_back([-(plane.x * x + plane.y * y + plane.z), pitch_rad, roll_rad]);
         let [(height_m, height_std), (pitch_rad, pitch_std), (roll_rad, roll_std)] =
             [0, 1, 2].map(|of| median_and_std(self.deviations.iter().map(|values| values[of]), &mut self.ascending));
@@ -174,6 +175,7 @@ fn fit(cells: &[[f64; 3]]) -> Option<Vector3<f64>> {
 /// Median and standard deviation of values; `ascending` is a buffer.
 fn median_and_std(values: impl Iterator<Item = f64>, ascending: &mut Vec<[f64; 2]>) -> (f64, f64) {
     ascending.clear();
+    ascending.reserve(SCANS_MAX);
     ascending.extend(values.map(|value| [value, 1.0]));
     ascending.sort_by(|a, b| a[0].total_cmp(&b[0]));
     (weighted_median(ascending), weighted_std(ascending))
