@@ -41,17 +41,19 @@ RESULTS = ["map_ms", "encode_ms", "bytes", "server_cores", "age_ms_p50", "age_ms
 # Greatest ages that Clearway aims at: of 1,000 readers, of 16 vehicles.
 AGE_MS_P99_TARGETS = {"readers": 20, "vehicles": 50}
 # The parts of the picture: quantity, what the cost is measured against and how it is written, results and how they
-# are written, scale of the axes.
+# are written, scales of both axes.
+MAP, SERVER = "processor time of a map, ms", "processor time of the server, s/s"
+AGE, AGES = "age of the maps, ms", {"age_ms_p50": "median", "age_ms_p99": "99th percentile"}
 PANELS = [
-    ("lasers", "lasers", "lasers of the sensor", ["map_ms"], "processor time of a map, ms", "linear"),
-    ("lasers", "points", "points of a map", ["map_ms"], "processor time of a map, ms", "linear"),
-    ("cells", "cells", "cells of the layer", ["map_ms"], "processor time of a map, ms", "linear"),
-    ("cells", "cells", "cells of the layer", ["encode_ms"], "processor time of encoding, ms", "linear"),
-    ("cells", "cells", "cells of the layer", ["bytes"], "bytes of a message", "log"),
-    ("readers", "readers", "gRPC readers", ["server_cores"], "processor time of the server, s/s", "log"),
-    ("readers", "readers", "gRPC readers", ["age_ms_p50", "age_ms_p99"], "age of the maps, ms", "log"),
-    ("vehicles", "vehicles", "vehicles", ["server_cores"], "processor time of the server, s/s", "linear"),
-    ("vehicles", "vehicles", "vehicles", ["age_ms_p50", "age_ms_p99"], "age of the maps, ms", "log"),
+    ("lasers", "lasers", "lasers of the sensor", ["map_ms"], MAP, ("linear", "linear")),
+    ("lasers", "points", "points of a map", ["map_ms"], MAP, ("linear", "linear")),
+    ("cells", "cells", "cells of the layer", ["map_ms"], MAP, ("linear", "linear")),
+    ("cells", "cells", "cells of the layer", ["encode_ms"], "processor time of encoding, ms", ("linear", "linear")),
+    ("cells", "cells", "cells of the layer", ["bytes"], "bytes of a message", ("log", "log")),
+    ("readers", "readers", "gRPC readers", ["server_cores"], SERVER, ("linear", "linear")),
+    ("readers", "readers", "gRPC readers", [*AGES], AGE, ("log", "linear")),
+    ("vehicles", "vehicles", "vehicles", ["server_cores"], SERVER, ("linear", "linear")),
+    ("vehicles", "vehicles", "vehicles", [*AGES], AGE, ("linear", "log")),
 ]
 
 
@@ -96,27 +98,35 @@ def draw(lines, file):
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     figure, grid = pyplot.subplots(3, 3, figsize=(18, 15), layout="constrained")
-    summary = medians(lines)
-    for axes, (quantity, against, x_label, results, y_label, scale) in zip(grid.flat, PANELS):
-        own = [line for line in lines if line["quantity"] == quantity]
-        for series in dict.fromkeys(line["series"] for line in own):
-            through = [values for (q, s, _), values in summary.items() if (q, s) == (quantity, series)]
-            through.sort(key=lambda values: values[against])
-            for result in results:
-                label = series if len(results) == 1 else {"age_ms_p50": "median", "age_ms_p99": "99th percentile"}[result]
-                (path,) = axes.plot([v[against] for v in through], [v[result] for v in through], label=label)
-                dots = [line for line in own if line["series"] == series]
-                xs, ys = ([float(line[name]) for line in dots] for name in [against, result])
-                axes.plot(xs, ys, ".", color=path.get_color(), alpha=0.4, markersize=5)
-        if results != ["server_cores"] and "age_ms_p99" in results:
+    thousands = ticker.FuncFormatter(lambda value, _: f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}")
+    for axes, (quantity, against, x_label, results, y_label, scales) in zip(grid.flat, PANELS):
+        draw_results(axes, [line for line in lines if line["quantity"] == quantity], against, results)
+        if y_label == AGE:
             axes.axhline(AGE_MS_P99_TARGETS[quantity], color="black", linestyle=":", label="target, 99th percentile")
         axes.set(title=f"{y_label.split(',')[0]} against {x_label}", xlabel=x_label, ylabel=y_label)
-        axes.set(xscale=scale, yscale=scale)
+        axes.set(xscale=scales[0], yscale=scales[1])
+        for axis in [axes.xaxis, axes.yaxis]:
+            axis.set_major_formatter(thousands)
         axes.legend()
     figure.savefig(file, dpi=100)
+
+
+def draw_results(axes, lines, against, results):
+    """For each series and result, a dot for each measurement and a line through the medians."""
+    through = {}
+    for (_, series, _), values in medians(lines).items():
+        through.setdefault(series, []).append(values)
+    for series, values in through.items():
+        values.sort(key=lambda median: median[against])
+        dots = [line for line in lines if line["series"] == series]
+        for result in results:
+            label = AGES.get(result, series)
+            (path,) = axes.plot([v[against] for v in values], [v[result] for v in values], label=label)
+            xs, ys = ([float(line[name]) for line in dots] for name in [against, result])
+            axes.plot(xs, ys, ".", color=path.get_color(), alpha=0.4, markersize=5)
 
 
 def show(lines):
