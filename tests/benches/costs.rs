@@ -4,9 +4,9 @@
 //!   cargo bench -p clearway-tests --bench costs -- lasers cells --rounds 20
 //!
 //! `lasers`: five sensor models in the simulated town, at 10 revolutions a second; each layer alone, all six, and none,
-//! which is decoding and moving the points. `cells`: an HDL-64E there; each layer alone, with the cells and columns that
-//! the configuration allows. A round processes one revolution in every setting. The first rounds, in which buffers get
-//! their sizes, are not counted.
+//! which is decoding and moving the points. `cells`: an HDL-64E there; each layer alone, with the cells and columns
+//! that the configuration allows. A round processes one revolution in every setting. The first rounds, in which
+//! buffers get their sizes, are not counted.
 //!
 //! Out: CSV, a line for each revolution and setting, for `tests/peers/costs.py`. `map_ms`: from the datagrams and poses
 //! of 100 ms to the map, with the ground, the reach and the layers that the layer needs. `encode_ms`, `bytes`: from the

@@ -10,7 +10,8 @@
 //! Age: time from sending the last packet of a revolution to receiving its map. Carried: time from the server's
 //! hand-over to the transport to receiving the map. The first reader decodes every map, as a planner does; the others
 //! receive the bytes, and acknowledge them over gRPC and to the page. Memory: growth of the server's resident set,
-//! divided by the number of readers. Cores: processor time of the server over the time that is measured. All processes use the clock of one machine.
+//! divided by the number of readers. Cores: processor time of the server over the time that is measured. All
+//! processes use the clock of one machine.
 
 mod drive;
 mod server;
