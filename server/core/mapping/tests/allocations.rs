@@ -8,10 +8,9 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
 
-/// Number of allocations that one map may need: one for the list of sensors in its header, one for the sort in the
-/// check of the mount, which keeps equal heights in their order, because the sum of their weights is rounded by it, and
-/// the others for the edges that the reach finds: each is a list of places and its sort.
-const MAP_MAX: u64 = 12;
+/// Number of allocations that one map may need: the list of sensors in its header, and the buffer of the sort in the
+/// check of the mount, which keeps equal heights in their order, because the sum of their weights is rounded by it.
+const MAP_MAX: u64 = 2;
 /// The same of a moving vehicle: a safe point more than in any map before takes memory for its links.
 const DRIVE_MAP_MAX: u64 = 300;
 /// Number of allocations that one datagram of telemetry may need: the fields of its sentence.

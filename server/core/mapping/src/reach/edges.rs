@@ -46,6 +46,8 @@ pub struct Edges {
     places_m: Vec<[f32; 2]>,
     /// By direction and line: number of these places on it.
     votes: Vec<u16>,
+    /// The places that the newest edge takes, or those it leaves while its votes are counted.
+    taken_m: Vec<[f32; 2]>,
     /// Places on a line: distance along it and across it, metres.
     on_line_m: Vec<[f32; 2]>,
 }
@@ -67,6 +69,7 @@ impl Edges {
             directions: (0..DIRECTIONS).map(angle).map(|(sin, cos)| [sin, cos]).collect(),
             places_m: Vec::new(),
             votes: vec![0; DIRECTIONS * LINES],
+            taken_m: Vec::new(),
             on_line_m: Vec::new(),
         }
     }
@@ -126,14 +129,15 @@ impl Edges {
     fn take(&mut self, direction: usize, best: usize) {
         let sin_cos @ [sin, cos] = self.directions[direction];
         let is_on = |place: &[f32; 2]| line(across_m(sin_cos, *place)).abs_diff(best) <= 1;
-        let all = std::mem::take(&mut self.places_m);
-        self.places_m.extend(all.iter().copied().filter(is_on));
+        self.taken_m.clear();
+        self.taken_m.extend(self.places_m.iter().copied().filter(is_on));
+        self.places_m.retain(|place| !is_on(place));
+        std::mem::swap(&mut self.places_m, &mut self.taken_m);
         self.count(|votes| *votes -= 1);
         self.on_line_m.clear();
         self.on_line_m.extend(self.places_m.iter().map(|[x, y]| [cos * x + sin * y, across_m(sin_cos, [*x, *y])]));
         self.on_line_m.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        self.places_m = all;
-        self.places_m.retain(|place| !is_on(place));
+        std::mem::swap(&mut self.places_m, &mut self.taken_m);
     }
 
     /// The edge through the longest run of places on a line without a gap; `None` if it is too short.
