@@ -5,7 +5,8 @@
 #
 # Gives FOLDER/clearway_VERSION_ARCHITECTURE.deb with /usr/bin/clearway, its systemd units, the user `clearway`, the
 # configuration /etc/clearway/clearway.toml, and completions. The service is not started at the first installation,
-# because the mounts of the sensors are not known yet. Needs dpkg-deb. The same binary and commit give the same file.
+# because the mounts of the sensors are not known yet. Needs dpkg-deb, strings and strip. The same binary and commit
+# give the same file.
 set -eu
 
 binary=$(realpath "${1:?usage: make-deb.sh BINARY FOLDER}")
@@ -36,6 +37,10 @@ install -D -m 644 deploy/systemd/clearway.sysusers "$package/usr/lib/sysusers.d/
 doc=$package/usr/share/doc/clearway
 install -D -m 644 deploy/README.md "$doc/README.md"
 install -D -m 644 deploy/debian/copyright "$doc/copyright"
+install -D -m 755 deploy/make-test-ca.sh "$doc/make-test-ca.sh"
+for settings in deploy/zenoh/*.json5; do
+    install -D -m 644 "$settings" "$doc/zenoh/${settings##*/}"
+done
 {
     printf 'clearway (%s) stable; urgency=medium\n\n  * See CHANGELOG.md of the sources.\n\n' "$version"
     printf ' -- The Clearway developers <clearway@localhost>  %s\n' "$(date -u -R -d "@$SOURCE_DATE_EPOCH")"
@@ -51,7 +56,7 @@ Maintainer: The Clearway developers <clearway@localhost>
 Section: science
 Priority: optional
 Depends: libc6 (>= $glibc), libgcc-s1
-Recommends: ca-certificates, systemd
+Recommends: ca-certificates, openssl, procps, systemd
 Installed-Size: $(du -sk --apparent-size "$package" | cut -f 1)
 Description: LIDAR packets to maps of where a vehicle may drive
  Clearway reads the datagrams of Velodyne sensors, makes one map for each

@@ -1,6 +1,7 @@
 //! The zenoh session that ingest and publishers share: its settings, its limits, its errors.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use zenoh::session::ZenohId;
@@ -47,15 +48,19 @@ const MESSAGE_BYTES_MAX: usize = 64 << 20;
 pub struct ZenohError {
     /// The operation, with the key or setting.
     what: String,
-    /// The reason that zenoh gives.
-    reason: zenoh::Error,
+    /// The reason that zenoh gives, without the places in its source.
+    reason: String,
 }
+
+/// Files in the configuration of zenoh, under `transport/link/tls`.
+const CERTIFICATE_FILES: [&str; 5] =
+    ["root_ca_certificate", "listen_certificate", "listen_private_key", "connect_certificate", "connect_private_key"];
 
 impl ZenohError {
     /// For `map_err`: names the operation that zenoh's error belongs to.
     pub(crate) fn of(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> Self {
         let what = what.into();
-        |reason| Self { what, reason }
+        move |reason| Self { what, reason: without_places(&reason.to_string()) }
     }
 }
 
@@ -133,8 +138,12 @@ impl PeerNames {
 fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config, ZenohError> {
     let mut config = match options.file.as_os_str().is_empty() {
         true => limited()?,
-        false => Config::from_file(&options.file)
-            .map_err(ZenohError::of(format!("zenoh.file {}", options.file.display())))?,
+        false => {
+            let read = Config::from_file(&options.file);
+            let mut config = read.map_err(ZenohError::of(format!("zenoh.file {}", options.file.display())))?;
+            find_certificates(&mut config, &options.file)?;
+            config
+        }
     };
     let json = |value: serde_json::Value| value.to_string();
     let settings = [
@@ -150,6 +159,40 @@ fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config,
         config.insert_json5(key, &value).map_err(ZenohError::of(format!("{key} = {value}")))?;
     }
     Ok(config)
+}
+
+/// Replaces the paths of certificates by those of the files: beside the configuration of zenoh that names them, else in
+/// the folder in which the server was started.
+fn find_certificates(config: &mut Config, file: &Path) -> Result<(), ZenohError> {
+    for name in CERTIFICATE_FILES {
+        let key = format!("transport/link/tls/{name}");
+        let value = config.get_json(&key).ok().and_then(|json| serde_json::from_str::<Option<PathBuf>>(&json).ok());
+        let Some(path) = value.flatten() else { continue };
+        let places = [file.parent().unwrap_or(Path::new("")).join(&path), path.clone()];
+        let what = || format!("zenoh.file {}: {key} = {}", file.display(), path.display());
+        let Some(found) = places.into_iter().find(|place| place.is_file()) else {
+            let reason = "no such file, neither beside that file nor in the folder in which the server was started";
+            return Err(ZenohError { what: what(), reason: reason.into() });
+        };
+        let found = serde_json::Value::from(found.display().to_string());
+        config.insert_json5(&key, &found.to_string()).map_err(ZenohError::of(what()))?;
+    }
+    Ok(())
+}
+
+/// A text of zenoh without the files and lines of its source.
+fn without_places(text: &str) -> String {
+    let mut parts = text.split(" at /");
+    let mut kept = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let (place, rest) = part.split_once(' ').unwrap_or((part, ""));
+        kept += &match (place.contains(".rs:"), rest) {
+            (true, "") => String::new(),
+            (true, rest) => format!(" {rest}"),
+            (false, _) => format!(" at /{part}"),
+        };
+    }
+    kept
 }
 
 /// The keys on which the server publishes.

@@ -58,6 +58,10 @@ impl Zenoh {
                 return Err(ValueError::new(key, endpoint, allowed));
             }
         }
+        if self.enabled && self.mode == ZenohMode::Client && self.connect.is_empty() && !self.scouting {
+            let allowed = "with zenoh.mode = \"client\" the endpoint of a router, such as \"tcp/192.168.1.10:7447\"";
+            return Err(ValueError::new("zenoh.connect", "[]", allowed));
+        }
         self.ros2.check(self.enabled, vehicles)
     }
 }

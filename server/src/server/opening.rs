@@ -4,8 +4,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures::FutureExt;
+use futures::future::BoxFuture;
 use tokio::sync::{Mutex, Notify};
-use tokio::task::JoinHandle;
 use zenoh::{Config as Settings, Session};
 
 use super::over_zenoh::{OverZenoh, Users};
@@ -17,9 +18,10 @@ use crate::zenoh_session;
 /// vehicles are served to the other readers.
 const START_WAITS_MAX: Duration = Duration::from_secs(2);
 
-/// The attempts to open a session, until one succeeds.
+/// The attempts to open a session, until one succeeds. They go on while [`Opening::first`] or [`Opening::finish`]
+/// waits.
 pub(super) struct Opening {
-    task: JoinHandle<Session>,
+    attempts: BoxFuture<'static, Session>,
     failed: Arc<Notify>,
 }
 
@@ -33,7 +35,7 @@ impl Opening {
         let failed = Arc::new(Notify::new());
         let (options, vehicles) = (users.config.zenoh.clone(), users.vehicles.clone());
         let notify = failed.clone();
-        let task = tokio::spawn(async move {
+        let attempts = async move {
             let mut away = Watch::new(options.connect.clone(), vehicles);
             loop {
                 match zenoh_session::open(settings.clone(), &options).await {
@@ -47,22 +49,22 @@ impl Opening {
                 away.note(false).await;
                 tokio::time::sleep(PERIOD).await;
             }
-        });
-        Self { task, failed }
+        };
+        Self { attempts: attempts.boxed(), failed }
     }
 
     /// The session, if the first attempt succeeds soon.
     pub(super) async fn first(&mut self) -> Option<Session> {
         tokio::select! {
-            session = &mut self.task => session.ok(),
+            session = &mut self.attempts => Some(session),
             () = self.failed.notified() => None,
             () = tokio::time::sleep(START_WAITS_MAX) => None,
         }
     }
 
     /// Waits for the session, and starts what uses it.
-    pub(super) async fn finish(mut self, users: Users, control: Option<RecorderControl>, connected: Connected) {
-        let Ok(session) = (&mut self.task).await else { return };
+    pub(super) async fn finish(self, users: Users, control: Option<RecorderControl>, connected: Connected) {
+        let session = self.attempts.await;
         let started = async {
             let mut over_zenoh = OverZenoh::start(session, &users).await?;
             over_zenoh.serve_recorder(&users.config, control.as_ref()).await?;
@@ -72,11 +74,5 @@ impl Opening {
             Ok(over_zenoh) => *connected.0.lock().await = Some(over_zenoh),
             Err(error) => tracing::error!(%error, "no maps over zenoh"),
         }
-    }
-}
-
-impl Drop for Opening {
-    fn drop(&mut self) {
-        self.task.abort();
     }
 }

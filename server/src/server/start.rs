@@ -24,6 +24,7 @@ use super::save_rules;
 use super::setup::{Setup, StartError};
 #[cfg(feature = "store")]
 use super::uploads;
+use crate::base::clock::now_ns;
 use crate::base::held_sockets::HeldSockets;
 #[cfg(feature = "zenoh")]
 use crate::config::ZenohMode;
@@ -39,6 +40,7 @@ use crate::publish::listen::{Listener, ListenerHandle};
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
 use crate::record::mcap_file::Header;
 use crate::record::writer::{Recorder, recording_path};
+use crate::status::network::end_text;
 use crate::status::{VehicleStatus, watch_states};
 use crate::traces::Traces;
 #[cfg(feature = "zenoh")]
@@ -346,6 +348,8 @@ async fn watch_listeners(
 ) {
     let watch = async {
         let mut every = tokio::time::interval(LISTENER_POLL_INTERVAL);
+        // The certificates whose ends are in the log, each with whether it had ended.
+        let mut told = Vec::new();
         loop {
             every.tick().await;
             let silent = |handle: &ListenerHandle| handle.silent().filter(|silent| *silent > LISTENER_SILENT_MAX);
@@ -354,6 +358,16 @@ async fn watch_listeners(
             let fault = fault.collect::<Vec<_>>().join("; ");
             let current = security.current();
             let ends = current.tls.as_ref().map_or(&[][..], |tls| &tls.ends_s);
+            let now_s = now_ns() / 1_000_000_000;
+            for (name, end_s) in ends {
+                let (Some(text), end) = (end_text(name, *end_s, now_s), (*name, *end_s, *end_s <= now_s)) else {
+                    continue;
+                };
+                if !told.contains(&end) {
+                    tracing::warn!("{text}");
+                    told.push(end);
+                }
+            }
             for served in vehicles.0.iter() {
                 served.status.network.set_listener_fault(&fault);
                 served.status.network.set_certificates(ends);

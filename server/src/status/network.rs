@@ -91,7 +91,7 @@ fn away_text(away: &Away, now: Instant) -> Option<String> {
     (lasts >= AWAY_NAMED_AFTER).then(text)
 }
 
-fn end_text(name: &str, end_s: i64, now_s: i64) -> Option<String> {
+pub(crate) fn end_text(name: &str, end_s: i64, now_s: i64) -> Option<String> {
     let left = Duration::from_secs((end_s - now_s).unsigned_abs());
     let then = "write a new one there, then SIGHUP";
     match end_s > now_s {

@@ -113,9 +113,11 @@ fn the_manifests_follow_the_schemas_of_kubernetes_and_their_configuration_is_val
     let refused = linter("kubernetes-validate").arg("--strict").arg(&manifests).output().expect("it starts");
     assert!(!refused.status.success(), "the schemas know every key");
 
-    // As the stateful set mounts it: certificates beside the configuration.
-    fs::copy(workspace().join("deploy/kubernetes/clearway-0.toml"), folder.path().join("clearway-0.toml"))
-        .expect("copied");
+    // As the stateful set mounts it: zenoh's settings and the certificates beside the configuration.
+    for file in ["deploy/kubernetes/clearway-0.toml", "deploy/zenoh/server.json5"] {
+        let name = Path::new(file).file_name().expect("a file");
+        fs::copy(workspace().join(file), folder.path().join(name)).expect("copied");
+    }
     let check = || run(folder.path(), "clearway", &["check", "--config", "clearway-0.toml"]);
     let without = check();
     assert!(!without.status.success() && said(&without).contains("certificates/ca.pem"), "{}", said(&without));

@@ -3,9 +3,15 @@
 use anyhow::Result;
 use clap::Args;
 
+use crate::base::clock::now_ns;
 use crate::cli::shared::configuration::ConfigurationOptions;
 use crate::cli::shared::output::print;
 use crate::config::{COMMENTED, Config};
+use crate::publish::listen::security::Current;
+use crate::server::StartError;
+use crate::status::network::end_text;
+#[cfg(feature = "zenoh")]
+use crate::zenoh_session;
 
 /// The first lines of the configuration that is printed.
 const HEAD: &str = "# Every value that this configuration has. A comment says where it was given: a line of the file \
@@ -34,7 +40,8 @@ pub struct Options {
 /// Prints the configuration that the options name, as TOML.
 ///
 /// # Errors
-/// [`ConfigError`](crate::config::ConfigError), also for a calibration or a certificate that the file names.
+/// [`ConfigError`](crate::config::ConfigError), also for a calibration or a certificate that the file names; an error
+/// of certificates that do not fit or of the file of `[zenoh]`.
 pub fn run(options: &Options) -> Result<()> {
     let Options { default, configuration } = options;
     if *default {
@@ -43,7 +50,17 @@ pub fn run(options: &Options) -> Result<()> {
     }
     let config = configuration.load()?;
     config.calibrations(&configuration.config)?;
-    config.certificates(&configuration.config)?;
+    let certificates = config.certificates(&configuration.config)?;
+    let current = Current::new(&config, certificates.as_ref()).map_err(StartError::Certificates)?;
+    for (name, end_s) in current.tls.iter().flat_map(|tls| &tls.ends_s) {
+        if let Some(text) = end_text(name, *end_s, now_ns() / 1_000_000_000) {
+            eprintln!("clearway: {text}");
+        }
+    }
+    #[cfg(feature = "zenoh")]
+    if config.zenoh.enabled {
+        zenoh_session::settings(&config.zenoh, 0, config.vehicles.iter().map(|vehicle| &*vehicle.name))?;
+    }
     let ConfigurationOptions { config: file, vehicles, .. } = configuration;
     print(&format!("{HEAD}{}", Config::explain(file, &configuration.overrides(), vehicles)?))?;
     Ok(())

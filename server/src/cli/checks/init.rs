@@ -52,7 +52,7 @@ pub struct Options {
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=3600))]
     seconds: u64,
     /// Name of the vehicle.
-    #[arg(long, value_name = "NAME", default_value = "car")]
+    #[arg(long, value_name = "NAME", default_value = "car", value_parser = vehicle_name)]
     vehicle: String,
     /// The file to write.
     #[arg(long, value_name = "FILE", default_value = "clearway.toml")]
@@ -253,6 +253,14 @@ impl Heard {
                 .into(),
             (false, _) => format!("what there was: {}", heard.join(", ")),
         }
+    }
+}
+
+/// The name of a vehicle as the configuration allows it.
+fn vehicle_name(text: &str) -> Result<String, String> {
+    match !text.is_empty() && text.bytes().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || b"_-".contains(&c)) {
+        true => Ok(text.to_owned()),
+        false => Err("lower-case letters, digits, \"_\" and \"-\" are allowed".to_owned()),
     }
 }
 

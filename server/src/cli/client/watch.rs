@@ -32,7 +32,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
-  clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 2
+  clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 5
   clearway watch --draw --layers occupancy --range 20
   clearway watch --count 10 --json
   clearway watch --until-stale || echo \"the maps are stale\"")]

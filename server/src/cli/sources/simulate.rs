@@ -59,7 +59,8 @@ pub struct Options {
     #[arg(value_parser = names())]
     scene: String,
     /// Model of the sensor; hdl64e is hdl64e_s2.
-    #[arg(long, value_name = "MODEL", default_value = "hdl64e_s2", value_parser = ModelParser::simulated())]
+    #[arg(long, visible_alias = "model", value_name = "MODEL", default_value = "hdl64e_s2")]
+    #[arg(value_parser = ModelParser::simulated())]
     sensor: Model,
     /// Duration of the drive, in seconds.
     #[arg(long, default_value = "10", value_parser = seconds)]

@@ -132,7 +132,13 @@ impl Maps {
         let elsewhere = self.fleet.address_of(name, Instant::now()).filter(|_| caller.may_reach(name));
         let Some((address, value)) = elsewhere.and_then(|address| Some((address.clone(), address.parse().ok()?)))
         else {
-            return Err(unknown.into());
+            let servers = self.fleet.servers_of(name, Instant::now());
+            return Err(match servers.first().filter(|_| caller.may_reach(name)) {
+                Some(server) => Status::not_found(format!(
+                    "vehicle {name:?} is served by {server:?}, which announces no address: set grpc.advertise there"
+                )),
+                None => unknown.into(),
+            });
         };
         let mut led = Status::not_found(format!("vehicle {name:?} is served at {address}"));
         led.metadata_mut().insert(SERVED_AT, value);

@@ -55,7 +55,7 @@ impl Tls {
                 }
             };
             let made = builder.with_single_cert(chain.clone(), key.clone_key());
-            let mut config = made.map_err(|error| format!("certificate and key: {error}"))?;
+            let mut config = made.map_err(|error| format!("grpc.tls.certificate and grpc.tls.key: {error}"))?;
             config.alpn_protocols = vec![protocol.into()];
             Ok::<_, String>(TlsAcceptor::from(Arc::new(config)))
         };
