@@ -207,7 +207,6 @@ pub async fn replay(
             return Err(error.into());
         }
     };
-    let ready_file = options.ready_file.as_deref().map(|file| ReadyFile::write(file, &running)).transpose();
     let running_vehicles = running.vehicles.clone();
     let status = running_vehicles.0[0].status.clone();
     let mut summary = Summary {
@@ -224,6 +223,8 @@ pub async fn replay(
         reached_end: false,
     };
     started(&running, &summary);
+    // After that, so that a program that waits for the file finds the addresses in the log too.
+    let ready_file = options.ready_file.as_deref().map(|file| ReadyFile::write(file, &running)).transpose();
 
     // Maps that are as recorded keep their boot id until the first jump.
     let first_boot_id = boot_id.filter(|_| !options.as_live).unwrap_or_else(random);
