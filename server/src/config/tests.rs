@@ -182,6 +182,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         ("[vehicle.udp]", "[vehicle.udp]\ngroups = [\"10.0.0.1\"]", "multicast"),
         ("[vehicle.udp]", "[vehicle.udp]\ngroups = [\"ff02::1\"]", "multicast"),
         ("[[vehicle]]", "[zenoh]\nlisten = [\"quic/1.2.3.4:1\"]\n[[vehicle]]", "tcp/127.0.0.1:7447"),
+        ("[[vehicle]]", "[zenoh]\nenabled = true\nmode = \"client\"\n[[vehicle]]", "the endpoint of a router"),
         ("[[vehicle]]", "[recorder]\nflush_ms = 1\n[[vehicle]]", "10 to 60000"),
         ("[[vehicle]]", "[recorder]\nmaps = \"some\"\n[[vehicle]]", "full"),
         ("[[vehicle]]", "[store]\nurl = \"ftp://a/b\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),

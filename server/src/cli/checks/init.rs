@@ -256,12 +256,11 @@ impl Heard {
     }
 }
 
-/// The name of a vehicle as the configuration allows it.
+/// The name of a vehicle, if a configuration allows it.
 fn vehicle_name(text: &str) -> Result<String, String> {
-    match !text.is_empty() && text.bytes().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || b"_-".contains(&c)) {
-        true => Ok(text.to_owned()),
-        false => Err("lower-case letters, digits, \"_\" and \"-\" are allowed".to_owned()),
-    }
+    let vehicle = Config::of_one_vehicle(text, "top").vehicles.remove(0);
+    vehicle.core().validate().map_err(|error| format!("allowed are {}", error.allowed))?;
+    Ok(text.to_owned())
 }
 
 /// The configuration with comments.
@@ -360,4 +359,17 @@ fn report(sensors: &[Found], options: &Options, text: &str) -> String {
         Err(error) => format!("wrote {file}, which is not complete yet: {error}"),
     });
     lines.join("\n") + "\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_vehicle_has_a_name_that_the_configuration_allows() {
+        assert_eq!(vehicle_name("car-1_b"), Ok("car-1_b".to_owned()));
+        for wrong in ["", "Car 1", &"a".repeat(65)] {
+            assert!(vehicle_name(wrong).unwrap_err().contains("1 to 64 of the characters a-z"), "{wrong}");
+        }
+    }
 }
