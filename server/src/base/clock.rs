@@ -3,7 +3,7 @@
 
 use std::fmt;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use nix::time::{ClockId, clock_gettime};
 
@@ -15,27 +15,21 @@ pub fn now_ns() -> i64 {
     }
 }
 
-/// The time since a start, and how much of it the calling thread has worked.
+/// How long a thread has had a processor since a start. Reading it is a system call.
 #[derive(Clone, Copy, Debug)]
-pub struct Stopwatch {
-    started: Instant,
-    worked_before: Duration,
+pub struct WorkTime {
+    before: Duration,
 }
 
-impl Stopwatch {
+impl WorkTime {
     /// Starts in the calling thread, which reads it too.
     pub fn start() -> Self {
-        Self { started: Instant::now(), worked_before: thread_time() }
-    }
-
-    /// The time since the start.
-    pub fn elapsed(&self) -> Duration {
-        self.started.elapsed()
+        Self { before: thread_time() }
     }
 
     /// The time for which the thread has had a processor since the start.
     pub fn worked(&self) -> Duration {
-        thread_time().saturating_sub(self.worked_before)
+        thread_time().saturating_sub(self.before)
     }
 }
 

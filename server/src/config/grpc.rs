@@ -112,6 +112,14 @@ impl Grpc {
             let allowed = "no name without grpc.tls.client_ca, the CA of the clients' certificates";
             return Err(ValueError::new("grpc.access", name, allowed));
         }
+        // A misspelt name would leave the one that was meant without a limit.
+        let has_access = |name: &String| {
+            readers.iter().chain(ingesters).chain(operators).chain(tokens.keys()).any(|other| other == name)
+        };
+        if let Some(name) = only.keys().find(|name| !has_access(name)) {
+            let allowed = "a name of readers, ingesters, operators or tokens";
+            return Err(ValueError::new("grpc.access.only", name, allowed));
+        }
         let (_, port) = host_and_port(&self.advertise);
         if self.advertise.contains("//") || port.is_some_and(|port| port.parse::<u16>().is_err()) {
             let allowed = "a host such as \"vehicle-7.example\", or host and port such as \"10.0.0.7:50051\"";

@@ -207,6 +207,20 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
 }
 
 #[test]
+fn a_limit_of_a_name_without_access_is_refused() {
+    let config = |names: &str| {
+        let tls = "[grpc.tls]\ncertificate = \"a.pem\"\nkey = \"a.key\"\nclient_ca = \"ca.pem\"\n";
+        parse(&format!("{tls}[grpc.access]\n{names}\n[grpc.access.only]\nplanner = {{ vehicles = [\"car\"] }}\n{NEEDED}"))
+    };
+    let refused = config("readers = [\"planer\"]").unwrap_err().to_string();
+    assert!(refused.contains("grpc.access.only = \"planner\": allowed: a name of readers"), "{refused}");
+    for names in ["readers", "ingesters", "operators"].map(|list| format!("{list} = [\"planner\"]")) {
+        config(&names).unwrap();
+    }
+    config("tokens = { planner = \"planner.token\" }").unwrap();
+}
+
+#[test]
 fn an_invalid_calibration_file_is_named_before_the_server_starts() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("clearway.toml");

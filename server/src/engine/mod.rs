@@ -18,7 +18,7 @@ pub mod turns;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{EgoPose, Event};
@@ -27,7 +27,7 @@ use clearway_proto::v1;
 use nalgebra::Vector3;
 use tokio::sync::watch;
 
-use crate::base::clock::{Stopwatch, now_ns};
+use crate::base::clock::{WorkTime, now_ns};
 use crate::encode::{self, EncodedMap, Replayed};
 use crate::engine::newest::Newest;
 use crate::engine::turns::{Turn, Turns};
@@ -77,20 +77,28 @@ impl Engine {
             }
             let _stopped = Stopped(self.status.clone());
             self.status.engine_beats();
-            let mut turn = None;
+            let (mut turn, mut work) = (None, WorkTime::start());
             while let Some(queued) = self.next(&events, &mut turn) {
                 self.status.engine_beats();
-                turn = turn.or_else(|| Some(turns.wait()));
+                turn = turn.or_else(|| {
+                    work = WorkTime::start();
+                    Some(turns.wait())
+                });
                 let maps = self.maps();
-                self.step(queued);
+                self.step_in_turn(queued, work);
                 turn = turn.filter(|_| self.maps() == maps);
             }
         })
     }
 
-    /// Handles one event in the calling thread; the thread of [`Engine::start`] calls it for each.
-    pub fn step(&mut self, QueuedEvent { event, receipt, .. }: QueuedEvent) {
-        let outcome = self.step_event(&event);
+    /// Handles one event in the calling thread.
+    pub fn step(&mut self, queued: QueuedEvent) {
+        self.step_in_turn(queued, WorkTime::start());
+    }
+
+    /// Handles one event; `work` is the time of a turn so far.
+    fn step_in_turn(&mut self, QueuedEvent { event, receipt, .. }: QueuedEvent, work: WorkTime) {
+        let outcome = self.step_event(&event, work);
         // After everything else: a client that receives the outcome finds the map published and counted.
         if let Some(receipt) = receipt {
             self.update_status();
@@ -117,7 +125,7 @@ impl Engine {
             self.newest.send_replace(None);
             self.status.sweeps.send_replace(None);
         }
-        self.publish(Stopwatch::start(), None);
+        self.publish(Instant::now(), None, None);
     }
 
     /// Copies the ledger and the sensors into the status; the thread of [`Engine::start`] does so whenever no event
@@ -156,22 +164,22 @@ impl Engine {
 
     /// Computes the newest map again for readers that came after the last event, if it was computed without any reader.
     fn complete_newest_map(&mut self) {
-        let stopwatch = Stopwatch::start();
+        let began = Instant::now();
         self.update_layers();
         if self.pipeline.remake_newest_map().is_some() {
-            self.publish(stopwatch, None);
+            self.publish(began, None, None);
         }
     }
 
-    fn step_event(&mut self, event: &Event) -> Result<(), EventError> {
+    fn step_event(&mut self, event: &Event, work: WorkTime) -> Result<(), EventError> {
         if let Some(recording) = &mut self.recording {
             recording.record_event(event);
         }
-        let (stopwatch, waited) = (Stopwatch::start(), duration(now_ns().saturating_sub(event.arrival_ns)));
+        let (began, waited) = (Instant::now(), duration(now_ns().saturating_sub(event.arrival_ns)));
         self.update_layers();
         let outcome = self.pipeline.step(event).map(|map| map.is_some());
         match &outcome {
-            Ok(true) => self.publish(stopwatch, waited),
+            Ok(true) => self.publish(began, Some(work), waited),
             Ok(false) => {}
             Err(error) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
@@ -183,10 +191,10 @@ impl Engine {
         outcome.map(|_| ())
     }
 
-    /// Encodes the newest map and gives it to readers, recorder and observer. The stopwatch was started with its
-    /// computation, after its event had `waited`, if that is known.
-    fn publish(&mut self, stopwatch: Stopwatch, waited: Option<Duration>) {
-        let computed = stopwatch.elapsed();
+    /// Encodes the newest map and gives it to readers, recorder and observer. Its computation `began` after its event
+    /// had `waited`; `work` is what its turn has taken so far. Both are `None` if no event made the map.
+    fn publish(&mut self, began: Instant, work: Option<WorkTime>, waited: Option<Duration>) {
+        let computed = began.elapsed();
         let Some(map) = self.pipeline.newest_map() else { return };
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
         let encoded = (!self.status.layers.is_empty()).then(|| {
@@ -194,8 +202,10 @@ impl Engine {
             let (name, boot_id) = (self.status.name.clone(), self.status.boot_id);
             (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
         });
-        let encoding = stopwatch.elapsed().saturating_sub(computed);
-        self.status.map_time.record(self.pipeline.newest_sweep().x.len(), stopwatch.worked());
+        let encoding = began.elapsed().saturating_sub(computed);
+        if let Some(work) = work {
+            self.status.map_time.record(self.pipeline.newest_sweep().x.len(), work.worked());
+        }
         let speed_m_s = map.speed_mps;
         // The points come before the map, so that a reader of the map finds its points.
         if self.status.sweeps.receiver_count() > 0 {

@@ -242,13 +242,17 @@ async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapSt
     if let Some(file) = &options.signed_by {
         client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
     }
-    let vehicle = match &options.vehicle {
-        Some(name) => name.clone(),
-        None => match &client.vehicles().await?[..] {
-            [] => bail!("no server at {endpoint} publishes a vehicle"),
-            [only] => only.clone(),
-            several => bail!("{endpoint} has {}: name one with --vehicle", several.join(", ")),
-        },
+    let vehicle = match (&options.vehicle, &client.vehicles().await?[..]) {
+        (Some(name), present) => {
+            if !present.contains(name) {
+                let others = if present.is_empty() { "none" } else { &present.join(", ") };
+                eprintln!("clearway: --vehicle {name}: no server at {endpoint} publishes it now (others: {others})");
+            }
+            name.clone()
+        }
+        (None, []) => bail!("no server at {endpoint} publishes a vehicle"),
+        (None, [only]) => only.clone(),
+        (None, several) => bail!("{endpoint} has {}: name one with --vehicle", several.join(", ")),
     };
     Ok(client.subscribe(&vehicle, layer).await?)
 }

@@ -28,6 +28,8 @@ const ROW_SHIFT: u32 = 20;
 const KEPT: usize = 3;
 /// Return of a cell without one.
 const NONE: u32 = u32::MAX;
+/// A cell without returns.
+const EMPTY: Cell = Cell { lowest: [NONE; KEPT], highest: 0 };
 /// Offset that makes each height positive, metres, plus half a millimetre for rounding.
 const OFFSET_M: f32 = 32.0005;
 /// Steps of a return's place within its cell, along the range and along the azimuth.
@@ -44,33 +46,46 @@ pub struct Return {
     pub z_m: f32,
 }
 
+/// The returns that are kept of a cell: height in millimetres in the upper 16 bits, then the place within the cell along
+/// the range and along the azimuth, 8 bits each.
+#[derive(Clone, Copy)]
+struct Cell {
+    /// Ascending.
+    lowest: [u32; KEPT],
+    highest: u32,
+}
+
+impl Cell {
+    /// It has no branches: which returns are kept cannot be predicted.
+    #[inline(always)]
+    fn add_return(&mut self, key: u32) {
+        let [first, second, third] = self.lowest;
+        self.lowest = [first.min(key), first.max(key).min(second), second.max(key).min(third)];
+        self.highest = self.highest.max(key);
+    }
+}
+
 /// The returns of each cell; index `row * COLUMNS + column`.
 #[derive(Clone)]
 pub struct PolarCells {
     azimuths: AzimuthColumns,
     outline: Outline,
-    /// The lowest returns of each cell, ascending: height in millimetres in the upper 16 bits, then the place within
-    /// the cell along the range and along the azimuth, 8 bits each.
-    lowest: Vec<[u32; KEPT]>,
+    cells: Vec<Cell>,
     /// Row and column coordinate by point of the sweep.
     coordinates: [Vec<f32>; 2],
-    /// Height of the highest return of each cell, as the upper 16 bits of a return.
-    highest: Vec<u16>,
 }
 
 impl PolarCells {
     /// Cells without returns around a vehicle with this outline.
     pub fn new(outline: Outline) -> Self {
         let azimuths = AzimuthColumns::new(COLUMNS as u16);
-        let (lowest, highest) = (vec![[NONE; KEPT]; CELLS], vec![0; CELLS]);
-        Self { azimuths, outline, lowest, coordinates: Default::default(), highest }
+        Self { azimuths, outline, cells: vec![EMPTY; CELLS], coordinates: Default::default() }
     }
 
     /// Replaces the returns by those of a sweep. A return far above or below the plane under the vehicle (a gradient of
     /// 30 % and 1.5 m) cannot be ground and is left out, and so are the returns of the vehicle itself.
     pub fn sort_points(&mut self, sweep: &Sweep) {
-        self.lowest.fill([NONE; KEPT]);
-        self.highest.fill(0);
+        self.cells.fill(EMPTY);
         let [mut rows, mut turns] = std::mem::take(&mut self.coordinates);
         rows.resize(sweep.x.len(), 0.0);
         turns.resize(sweep.x.len(), 0.0);
@@ -81,13 +96,9 @@ impl PolarCells {
             find_coordinates(&self.azimuths, [xs, ys], [rows, turns]);
             self.find_cells([xs, ys, zs, rows, turns], &mut cells, &mut keys);
             for (&cell, &key) in cells.iter().zip(&keys).take(xs.len()) {
-                if key == NONE {
-                    continue;
+                if key != NONE {
+                    self.cells[cell as usize].add_return(key);
                 }
-                let cell = cell as usize;
-                insert(&mut self.lowest[cell], key);
-                let highest = &mut self.highest[cell];
-                *highest = (*highest).max((key >> 16) as u16);
             }
         }
         self.coordinates = [rows, turns];
@@ -124,18 +135,18 @@ impl PolarCells {
 
     /// The up to three lowest returns of a cell, lowest first.
     pub fn lowest(&self, cell: usize) -> impl Iterator<Item = Return> {
-        self.lowest[cell].into_iter().take_while(|key| *key != NONE).map(move |key| unpack(cell / COLUMNS, key))
+        self.cells[cell].lowest.into_iter().take_while(|key| *key != NONE).map(move |key| unpack(cell / COLUMNS, key))
     }
 
     /// True if the cell has a return.
     pub fn is_seen(&self, cell: usize) -> bool {
-        self.lowest[cell][0] != NONE
+        self.cells[cell].lowest[0] != NONE
     }
 
     /// Height of the cell's highest return over its lowest one, metres; 0 without returns.
     pub fn span_m(&self, cell: usize) -> f32 {
-        let lowest = self.lowest[cell][0];
-        if lowest == NONE { 0.0 } else { (f32::from(self.highest[cell]) - (lowest >> 16) as f32) * 1e-3 }
+        let Cell { lowest: [lowest, ..], highest } = self.cells[cell];
+        if lowest == NONE { 0.0 } else { ((highest >> 16) as f32 - (lowest >> 16) as f32) * 1e-3 }
     }
 
     /// Coordinates of a position; see [`find_coordinates`].
@@ -188,15 +199,6 @@ impl PolarIndex {
     #[inline(always)]
     pub fn of<T>(self, values: &[T]) -> Option<&T> {
         values.get(usize::from(self.0))
-    }
-}
-
-/// Inserts a return among the lowest of a cell.
-#[inline(always)]
-fn insert(lowest: &mut [u32; KEPT], key: u32) {
-    let [first, second, third] = *lowest;
-    if key < third {
-        *lowest = [first.min(key), first.max(key).min(second), second.max(key)];
     }
 }
 

@@ -134,6 +134,11 @@ impl Bits {
         self.words.copy_from_slice(&other.words);
     }
 
+    /// Sets the bits that are set in an equally large square.
+    pub fn add(&mut self, other: &Self) {
+        self.words.iter_mut().zip(&other.words).for_each(|(word, other)| *word |= other);
+    }
+
     /// Calls `each` with each cell whose bit is set, row by row.
     pub fn each(&self, mut each: impl FnMut(usize, usize)) {
         for (at, word) in self.words.iter().enumerate() {

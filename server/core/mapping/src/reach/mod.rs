@@ -26,6 +26,7 @@ mod edges;
 mod flood;
 mod joins;
 mod obstacles;
+mod polar_runs;
 mod shadow;
 mod steps;
 mod troughs;
@@ -44,12 +45,11 @@ use edges::Edges;
 use flood::{Bits, Flood};
 use joins::Joins;
 use obstacles::Obstacles;
+use polar_runs::{PolarRuns, WORD};
 use shadow::Shadow;
 use steps::Steps;
 use troughs::Troughs;
 
-/// Number of cells of a word of bits.
-const WORD: usize = 64;
 /// Number of points that are processed together. Ours: their cells fit into the first-level cache.
 const CHUNK: usize = 1024;
 /// Least height that an obstacle's returns span if it casts a shadow, metres. Ours: kerbs cast none; not tuned.
@@ -65,9 +65,9 @@ enum View {
     /// It does not.
     Closed = 0,
     /// It does.
-    Clear = 1,
+    Clear = 0b01,
     /// It does where no obstacle casts a shadow on it.
-    BesideObstacle = 2,
+    BesideObstacle = 0b10,
 }
 
 /// Cell of [`Reach`] that contains a position; [`ReachCell::at`] finds it once for a fixed position.
@@ -94,6 +94,7 @@ pub struct Reach {
     config: ReachConfig,
     /// By cell: the polar cell of its centre.
     polar_of_cell: Vec<PolarIndex>,
+    polar_runs: PolarRuns,
     /// Indices of the cells under the vehicle.
     under_vehicle: Vec<usize>,
     obstacles: Obstacles,
@@ -122,9 +123,11 @@ impl Reach {
         let outline = Outline { width_m: config.vehicle_width_m.min(STRIP_M), ..config.outline() };
         let centres_m = (0..SIDE * SIDE).map(|cell| (cell, cells::centre_m(cell)));
         let bits = Bits::square(SIDE);
+        let polar_of_cell: Vec<_> = centres_m.clone().map(|(_, [x, y])| PolarIndex::at(x, y)).collect();
         Self {
             config: config.clone(),
-            polar_of_cell: centres_m.clone().map(|(_, [x, y])| PolarIndex::at(x, y)).collect(),
+            polar_runs: PolarRuns::new(&polar_of_cell),
+            polar_of_cell,
             under_vehicle: centres_m.filter(|(_, [x, y])| outline.contains(*x, *y)).map(|(cell, _)| cell).collect(),
             obstacles: Obstacles::new(),
             steps: Steps::new(),
@@ -225,13 +228,10 @@ impl Reach {
             }
         }
         self.classify_polar_cells(confidences);
-        let (polar_of_cell, shadow, views) = (&self.polar_of_cell, &self.shadow, &self.views);
+        let (runs, shadow, views) = (&self.polar_runs, &self.shadow, &self.views);
         self.open.fill_words(|cells| {
-            let mut of_word = [View::Closed as u8; WORD];
-            for (view, polar) in of_word.iter_mut().zip(&polar_of_cell[cells.clone()]) {
-                *view = polar.of(views).map_or(View::Closed as u8, |view| *view as u8);
-            }
-            let [mut clear, mut beside] = [View::Clear, View::BesideObstacle].map(|view| bits_of(view, &of_word));
+            let view_of = |polar: PolarIndex| polar.of(views).map_or(View::Closed as u8, |view| *view as u8);
+            let [mut clear, mut beside] = runs.bits(cells.start / WORD, view_of);
             while beside != 0 {
                 let bit = beside.trailing_zeros() as usize;
                 clear |= u64::from(!shadow.hides(cells.start + bit)) << bit;
@@ -239,7 +239,8 @@ impl Reach {
             }
             clear
         });
-        for cell in self.steps.seen().chain(self.under_vehicle.iter().copied()) {
+        self.open.add(self.steps.seen());
+        for cell in &self.under_vehicle {
             self.open.set(cell % SIDE, cell / SIDE);
         }
     }
@@ -268,17 +269,6 @@ impl Reach {
         rows.flat_map(|row| [-1, 0, 1].map(|offset| row * COLUMNS + beside(column, offset)))
             .any(|cell| self.has_obstacle[cell])
     }
-}
-
-/// One bit for each cell of a word, set if its view is `view`.
-fn bits_of(view: View, of_word: &[u8; WORD]) -> u64 {
-    let (eights, _) = of_word.as_chunks::<8>();
-    let bit = (view as u8).trailing_zeros();
-    eights.iter().enumerate().fold(0, |word, (byte, views)| {
-        // One bit a byte; the product has them side by side in its highest byte.
-        let bits = u64::from_le_bytes(*views) >> bit & 0x0101_0101_0101_0101;
-        word | bits.wrapping_mul(0x0102_0408_1020_4080) >> 56 << (8 * byte)
-    })
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@
 
 use super::cells::{CELL_M, SIDE};
 use super::config::ReachConfig;
+use super::flood::Bits;
 
 /// Lowest height over the ground of a return that is used, metres. Ours: lower ones are mirror images.
 const LOWEST_M: f32 = -1.5;
@@ -18,21 +19,20 @@ const EMPTY: [i16; 2] = [i16::MAX, i16::MIN];
 pub struct Steps {
     /// Millimetres, ego frame.
     spans: Vec<[i16; 2]>,
-    /// Indices of the cells with a return.
-    seen: Vec<u32>,
+    /// The cells with a return.
+    seen: Bits,
 }
 
 impl Steps {
     /// Cells without a return.
     pub fn new() -> Self {
-        Self { spans: vec![EMPTY; SIDE * SIDE], seen: Vec::new() }
+        Self { spans: vec![EMPTY; SIDE * SIDE], seen: Bits::square(SIDE) }
     }
 
     /// Removes all returns.
     pub fn clear(&mut self) {
-        for cell in self.seen.drain(..) {
-            self.spans[cell as usize] = EMPTY;
-        }
+        self.seen.each(|ix, iy| self.spans[iy * SIDE + ix] = EMPTY);
+        self.seen.clear();
     }
 
     /// Adds a return from the ground of a cell, at these heights in the ego frame and over the ground, metres.
@@ -40,9 +40,7 @@ impl Steps {
     pub fn add_point(&mut self, cell: u32, z_m: f32, height_m: f32) {
         if height_m > LOWEST_M {
             let span = &mut self.spans[cell as usize];
-            if *span == EMPTY {
-                self.seen.push(cell);
-            }
+            self.seen.set(cell as usize % SIDE, cell as usize / SIDE);
             // Ground is within 20 m of the vehicle's height; the cast saturates.
             let millimetres = (z_m * 1000.0) as i16;
             *span = [span[0].min(millimetres), span[1].max(millimetres)];
@@ -56,13 +54,12 @@ impl Steps {
             let distance_m = CELL_M * ((dx * dx + dy * dy) as f32).sqrt();
             (dy * SIDE as isize + dx, least_mm.max((config.step_slope_min * distance_m * 1000.0) as i32))
         });
-        // The outermost cells are compared with fewer others.
-        let is_inside = |cell: usize| {
-            let (ix, iy) = (cell % SIDE, cell / SIDE);
-            (2..SIDE - 2).contains(&ix) && iy < SIDE - 2
-        };
-        for &cell in self.seen.iter().filter(|cell| is_inside(**cell as usize)) {
-            let cell = cell as usize;
+        self.seen.each(|ix, iy| {
+            // The outermost cells are compared with fewer others.
+            if !(2..SIDE - 2).contains(&ix) || iy >= SIDE - 2 {
+                return;
+            }
+            let cell = iy * SIDE + ix;
             let [low, high] = self.spans[cell].map(i32::from);
             if high - low >= least_mm {
                 mark(cell);
@@ -76,7 +73,7 @@ impl Steps {
                     mark(other);
                 }
             }
-        }
+        });
     }
 
     /// Height of the lowest return from the ground of a cell, millimetres; the largest number without one.
@@ -84,9 +81,9 @@ impl Steps {
         self.spans[cell][0]
     }
 
-    /// Indices of the cells with a return from the ground.
-    pub fn seen(&self) -> impl Iterator<Item = usize> {
-        self.seen.iter().map(|cell| *cell as usize)
+    /// The cells with a return from the ground.
+    pub fn seen(&self) -> &Bits {
+        &self.seen
     }
 }
 

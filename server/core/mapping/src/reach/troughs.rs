@@ -7,6 +7,7 @@
 //! resolution.
 
 use super::cells::SIDE;
+use super::flood::Bits;
 
 /// Number of cells along a side of a coarse cell.
 const FOLD: usize = 2;
@@ -58,22 +59,22 @@ impl Troughs {
     /// `lowest_mm` is the height of a cell's lowest one.
     pub fn find(
         &mut self,
-        seen: impl Iterator<Item = usize>,
+        seen: &Bits,
         lowest_mm: impl Fn(usize) -> i16,
         mut mark: impl FnMut(usize, usize),
     ) {
         for cell in self.seen.drain(..) {
             self.low[cell as usize] = NONE;
         }
-        for cell in seen {
-            let coarse = cell / SIDE / FOLD * COARSE + cell % SIDE / FOLD;
+        seen.each(|ix, iy| {
+            let coarse = iy / FOLD * COARSE + ix / FOLD;
             let low = &mut self.low[coarse];
             if *low == NONE {
                 self.seen.push(coarse as u32);
                 *low = EMPTY;
             }
-            *low = (*low).min(lowest_mm(cell));
-        }
+            *low = (*low).min(lowest_mm(iy * SIDE + ix));
+        });
         self.find_boxes();
         for coarse in self.seen.iter().map(|coarse| *coarse as usize).filter(|coarse| self.is_trough(*coarse)) {
             let highest_mm = self.low[coarse].saturating_add(FLOOR_MM_MAX);
@@ -130,12 +131,13 @@ mod tests {
 
     /// Cells in troughs of ground with this height, seen at places that `is_seen` is true for.
     fn troughs(height_m: impl Fn([f32; 2]) -> f32, is_seen: impl Fn([f32; 2]) -> bool) -> Vec<[f32; 2]> {
-        let (mut found, seen) = (Vec::new(), (0..SIDE * SIDE).filter(|cell| is_seen(centre_m(*cell))));
+        let (mut found, mut seen) = (Vec::new(), Bits::square(SIDE));
+        seen.fill(|cell| is_seen(centre_m(cell)));
         let lowest_mm = |cell: usize| {
             let place = centre_m(cell);
             if is_seen(place) { (height_m(place) * 1000.0) as i16 } else { EMPTY }
         };
-        Troughs::new().find(seen, lowest_mm, |ix, iy| found.push(centre_m(iy * SIDE + ix)));
+        Troughs::new().find(&seen, lowest_mm, |ix, iy| found.push(centre_m(iy * SIDE + ix)));
         found
     }
 
