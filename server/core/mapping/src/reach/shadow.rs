@@ -12,11 +12,20 @@ const AZIMUTHS: usize = 1440;
 /// Number of distance steps. Ours: one bit each of a 64-bit word.
 const STEPS: usize = 64;
 
+/// Place of a cell's centre, in half the bytes of its azimuth and distance.
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    azimuth: u16,
+    step: u8,
+}
+
 /// Shadows on the ground by azimuth and distance.
 #[derive(Clone, Debug)]
 pub struct Shadow {
-    /// By cell: azimuth and distance of its centre.
-    polar_of_cell: Vec<(u16, f32)>,
+    /// By cell: distance of its centre, metres.
+    distances_m: Vec<f32>,
+    /// By cell: azimuth and distance step of its centre.
+    places: Vec<Place>,
     steps_a_m: f32,
     /// By azimuth: one bit for each distance step, set if it is hidden.
     hidden: Vec<u64>,
@@ -25,9 +34,11 @@ pub struct Shadow {
 impl Shadow {
     /// Shadows on cells with these centres; none yet.
     pub fn new(centres_m: impl Iterator<Item = [f32; 2]>) -> Self {
-        let polar_of_cell: Vec<(u16, f32)> = centres_m.map(polar).collect();
-        let farthest_m = polar_of_cell.iter().map(|(_, distance_m)| *distance_m).fold(1.0, f32::max);
-        Self { polar_of_cell, steps_a_m: (STEPS - 1) as f32 / farthest_m, hidden: vec![0; AZIMUTHS] }
+        let (azimuths, distances_m): (Vec<u16>, Vec<f32>) = centres_m.map(polar).unzip();
+        let steps_a_m = (STEPS - 1) as f32 / distances_m.iter().copied().fold(1.0, f32::max);
+        let place = |(azimuth, distance_m): (u16, &f32)| Place { azimuth, step: (distance_m * steps_a_m) as u8 };
+        let places = azimuths.into_iter().zip(&distances_m).map(place).collect();
+        Self { distances_m, places, steps_a_m, hidden: vec![0; AZIMUTHS] }
     }
 
     /// Removes all shadows.
@@ -38,7 +49,7 @@ impl Shadow {
     /// Adds the shadow of an obstacle that spans these heights in a cell of this size, with the sensor at height
     /// `sensor_m`.
     pub fn cast(&mut self, cell: usize, cell_m: f32, [lowest_m, highest_m]: [f32; 2], sensor_m: f32) {
-        let (azimuth, distance_m) = self.polar_of_cell[cell];
+        let (azimuth, distance_m) = (self.places[cell].azimuth, self.distances_m[cell]);
         // Distance at which the ray over a height meets the ground.
         let meets = |height_m: f32| {
             if height_m < sensor_m { distance_m * sensor_m / (sensor_m - height_m) } else { f32::INFINITY }
@@ -58,8 +69,8 @@ impl Shadow {
 
     /// True if the ground in a cell is hidden.
     pub fn hides(&self, cell: usize) -> bool {
-        let (azimuth, distance_m) = self.polar_of_cell[cell];
-        self.hidden[usize::from(azimuth)] >> (distance_m * self.steps_a_m) as usize & 1 != 0
+        let Place { azimuth, step } = self.places[cell];
+        self.hidden[usize::from(azimuth)] >> step & 1 != 0
     }
 }
 

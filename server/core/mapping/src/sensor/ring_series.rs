@@ -16,6 +16,8 @@ use crate::sensor::sweep::classify;
 const STEP_RAD_MIN: f32 = 2e-5;
 /// Share of a ring's azimuth step below which two points belong to one ray. Ours: rays jitter by less than their step.
 const SAME_RAY_SHARE: f32 = 0.1;
+/// Number of azimuth steps between two rays below which none is missing between them.
+const GAP_STEPS_MIN: f32 = 1.4;
 /// Least number of points of a ring with a series: as many as one mean has.
 const POINTS_MIN: usize = 2 * REACH + 1;
 
@@ -32,6 +34,8 @@ pub struct RingSeries {
     points: Vec<u64>,
     /// Of one ring, by point: x, y and z, metres.
     positions_m: [Vec<f32>; 3],
+    /// Of one ring, by point: range, metres.
+    point_ranges_m: Vec<f32>,
     /// Of one ring, by point: angle to the point before, radians.
     steps_rad: Vec<f32>,
     /// Bits of the steps of one ring that are no rounding, in any order. They rise with the step.
@@ -100,7 +104,10 @@ impl RingSeries {
             positions_m.clear();
             positions_m.extend(of_ring.iter().map(|key| from[*key as u32 as usize]));
         }
-        let [xs, ys, _] = &self.positions_m;
+        let [xs, ys, zs] = &self.positions_m;
+        let points = xs.iter().zip(ys).zip(zs);
+        self.point_ranges_m.clear();
+        self.point_ranges_m.extend(points.map(|((x, y), z)| (x * x + y * y + z * z).sqrt()));
         self.steps_rad.clear();
         self.steps_rad.push(0.0);
         let pairs = xs.iter().zip(ys).zip(xs[1..].iter().zip(&ys[1..]));
@@ -122,21 +129,18 @@ impl RingSeries {
         }
         let middle = self.candidates.len() / 2;
         let step_rad = f32::from_bits(*self.candidates.select_nth_unstable(middle).1);
-        let [xs, ys, zs] = &self.positions_m;
         let mut since_last_rad = f32::INFINITY;
-        let points = of_ring.iter().zip(&self.steps_rad).zip(xs.iter().zip(ys).zip(zs));
-        for ((&key, &rad), ((x, y), z)) in points {
+        for ((&key, &rad), &range_m) in of_ring.iter().zip(&self.steps_rad).zip(&self.point_ranges_m) {
             since_last_rad += rad;
             if since_last_rad < SAME_RAY_SHARE * step_rad {
                 continue;
             }
-            let range_m = (x * x + y * y + z * z).sqrt();
-            let steps = since_last_rad / step_rad;
-            if let Some(&last_m) = self.ranges_m.last()
-                && steps >= 1.5
+            // Less than one and a half steps round to one, which no ray misses.
+            if since_last_rad > GAP_STEPS_MIN * step_rad
+                && let Some(&last_m) = self.ranges_m.last()
             {
                 // `as` saturates. A mean reaches four ranges back, so that four missing ones are as good as all.
-                let missing = (steps.round() as usize).saturating_sub(1).min(REACH);
+                let missing = ((since_last_rad / step_rad).round() as usize).saturating_sub(1).min(REACH);
                 self.ranges_m.extend(std::iter::repeat_n(last_m, missing));
             }
             self.measured.push((self.ranges_m.len() as u32, key as u32));
