@@ -12,6 +12,7 @@
 //! | a layer | a scan event -> a map of that layer alone, with its ground and reach | see [`Floor`] |
 //! | occupancy_six_units | the scans of six sensors in 100 ms -> the layer | |
 //! | maps | a scan event -> a map of all six layers | |
+//! | without_LAYER | a scan event -> a map of the five other layers | |
 //! | encode | a map of six layers -> the bytes of each, with all channels | the runs of six grids of 160,000 cells |
 //!
 //! The first rounds, in which buffers get their sizes, are not counted.
@@ -115,7 +116,7 @@ struct Stages {
     datagrams: Vec<Box<[u8]>>,
     decoder: Sensor,
     scan: Scan,
-    /// A pipeline for each layer alone, by name, and under `maps` and `encode` one for all.
+    /// A pipeline for each stage that makes maps, by name.
     pipelines: BTreeMap<&'static str, Pipeline>,
     six_units: SixUnits,
     floor: Floor,
@@ -124,7 +125,7 @@ struct Stages {
 }
 
 impl Stages {
-    const NAMES: [&'static str; 10] = [
+    const NAMES: [&'static str; 16] = [
         "decode",
         "drivability",
         "height_difference",
@@ -134,6 +135,12 @@ impl Stages {
         "safe_path",
         "occupancy_six_units",
         "maps",
+        "without_drivability",
+        "without_height_difference",
+        "without_terrain",
+        "without_occupancy",
+        "without_speed",
+        "without_safe_path",
         "encode",
     ];
 
@@ -150,12 +157,16 @@ impl Stages {
             }
             None => (Scan::from(&vehicle.revolution(1)), 1.9),
         };
-        let alone = LAYERS.map(|layer| (layer, pipeline(height_m, &[layer])));
-        let all = ["maps", "encode"].map(|stage| (stage, pipeline(height_m, &LAYERS)));
+        let layers_of = |stage: &str| match stage.strip_prefix("without_") {
+            Some(without) => LAYERS.into_iter().filter(|layer| *layer != without).collect::<Vec<_>>(),
+            None if LAYERS.contains(&stage) => LAYERS.into_iter().filter(|layer| *layer == stage).collect(),
+            None => LAYERS.to_vec(),
+        };
+        let of_maps = Self::NAMES.into_iter().filter(|stage| !["decode", "occupancy_six_units"].contains(stage));
         Self {
             datagrams: datagrams.map(|datagram| datagram.payload.into()).collect(),
             decoder: Sensor::new(LidarConfig { model: Some(Model::Hdl64eS2), ..LidarConfig::default() }),
-            pipelines: alone.into_iter().chain(all).collect(),
+            pipelines: of_maps.map(|stage| (stage, pipeline(height_m, &layers_of(stage)))).collect(),
             six_units: SixUnits::new(),
             floor: Floor::new(&scan),
             scan,

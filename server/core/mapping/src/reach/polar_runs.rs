@@ -1,0 +1,84 @@
+//! Runs of cells of the grid whose centres lie in one polar cell: what is known of the polar cell is copied to 64 bits
+//! of the grid at a time.
+
+use crate::ground::polar::PolarIndex;
+
+/// Number of cells of a word of bits.
+pub const WORD: usize = 64;
+
+/// Some cells of a word, one after the other, in one polar cell.
+#[derive(Clone, Copy, Debug)]
+struct Run {
+    polar: PolarIndex,
+    /// Bit of the first cell.
+    first: u8,
+    /// Number of cells.
+    cells: u8,
+}
+
+impl Run {
+    #[inline(always)]
+    fn bits(self) -> u64 {
+        u64::MAX >> (WORD as u8 - self.cells) << self.first
+    }
+}
+
+/// The runs of each word of a grid. Cells beyond the polar grid are in none.
+#[derive(Clone, Debug)]
+pub struct PolarRuns {
+    runs: Vec<Run>,
+    /// Index of the first run of each word, and of the one after the last.
+    first_of_word: Vec<u32>,
+}
+
+impl PolarRuns {
+    /// The runs of a grid whose cells have their centres in these polar cells. A row is a whole number of words.
+    pub fn new(polar_of_cell: &[PolarIndex]) -> Self {
+        let (mut runs, mut first_of_word) = (Vec::new(), vec![0]);
+        for word in polar_of_cell.chunks(WORD) {
+            let mut first = 0;
+            for of_run in word.chunk_by(|one, next| one == next) {
+                let (polar, cells) = (of_run[0], of_run.len() as u8);
+                runs.extend(polar.index().map(|_| Run { polar, first, cells }));
+                first += cells;
+            }
+            first_of_word.push(runs.len() as u32);
+        }
+        Self { runs, first_of_word }
+    }
+
+    /// The bits of a word's cells, for each of `N` bits of the value of their polar cell, from the lowest on.
+    #[inline(always)]
+    pub fn bits<const N: usize>(&self, word: usize, of_polar: impl Fn(PolarIndex) -> u8) -> [u64; N] {
+        let mut bits = [0; N];
+        let runs = self.first_of_word[word] as usize..self.first_of_word[word + 1] as usize;
+        for run in &self.runs[runs] {
+            let (value, of_run) = (of_polar(run.polar), run.bits());
+            for (bit, bits) in bits.iter_mut().enumerate() {
+                *bits |= u64::from(value >> bit & 1).wrapping_neg() & of_run;
+            }
+        }
+        bits
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::cells::{SIDE, centre_m};
+    use super::*;
+    use crate::ground::polar::CELLS;
+
+    #[test]
+    fn each_cell_has_the_bits_of_its_polar_cell() {
+        let polar: Vec<_> = (0..SIDE * SIDE).map(centre_m).map(|[x, y]| PolarIndex::at(x, y)).collect();
+        let values: Vec<u8> = (0..CELLS as u32).map(|cell| (cell.wrapping_mul(2_654_435_761) >> 30) as u8).collect();
+        let runs = PolarRuns::new(&polar);
+        for (word, cells) in polar.chunks(WORD).enumerate() {
+            let [low, high] = runs.bits(word, |polar| *polar.of(&values).unwrap());
+            for (bit, polar) in cells.iter().enumerate() {
+                let value = polar.of(&values).copied().unwrap_or(0);
+                assert_eq!([low, high].map(|bits| bits >> bit & 1), [value & 1, value >> 1].map(u64::from));
+            }
+        }
+    }
+}
