@@ -210,10 +210,12 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
 fn a_limit_of_a_name_without_access_is_refused() {
     let config = |names: &str| {
         let tls = "[grpc.tls]\ncertificate = \"a.pem\"\nkey = \"a.key\"\nclient_ca = \"ca.pem\"\n";
-        parse(&format!("{tls}[grpc.access]\n{names}\n[grpc.access.only]\nplanner = {{ vehicles = [\"car\"] }}\n{NEEDED}"))
+        parse(&format!(
+            "{tls}[grpc.access]\n{names}\n[grpc.access.only]\nplanner = {{ vehicles = [\"car\"] }}\n{NEEDED}"
+        ))
     };
     let refused = config("readers = [\"planer\"]").unwrap_err().to_string();
-    assert!(refused.contains("grpc.access.only = \"planner\": allowed: a name of readers"), "{refused}");
+    assert!(refused.contains("grpc.access.only = planner: allowed: a name of readers"), "{refused}");
     for names in ["readers", "ingesters", "operators"].map(|list| format!("{list} = [\"planner\"]")) {
         config(&names).unwrap();
     }

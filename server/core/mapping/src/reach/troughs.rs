@@ -57,12 +57,7 @@ impl Troughs {
 
     /// Calls `mark` with column and row of each cell in a trough. `seen` are the cells with a return from the ground,
     /// `lowest_mm` is the height of a cell's lowest one.
-    pub fn find(
-        &mut self,
-        seen: &Bits,
-        lowest_mm: impl Fn(usize) -> i16,
-        mut mark: impl FnMut(usize, usize),
-    ) {
+    pub fn find(&mut self, seen: &Bits, lowest_mm: impl Fn(usize) -> i16, mut mark: impl FnMut(usize, usize)) {
         for cell in self.seen.drain(..) {
             self.low[cell as usize] = NONE;
         }
