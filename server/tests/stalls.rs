@@ -244,6 +244,9 @@ async fn watch_says_stale_when_nothing_comes_and_its_exit_code_too() {
             "{at:?}: {said}"
         );
     }
+    let of_another = ["--vehicle", "cra", "--until-stale"].map(str::to_owned);
+    let said = text(&watch([&zenoh[..], &of_another].concat()).await.stderr);
+    assert!(said.contains("--vehicle cra: no server") && said.contains("publishes it now (others: car)"), "{said}");
     // With data that end.
     for (at, stops) in [(&grpc, false), (&zenoh, false), (&zenoh, true)] {
         let vehicle = Vehicle::driving_to(server.data, Pace::RealTime);

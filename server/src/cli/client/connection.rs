@@ -91,11 +91,20 @@ fn advice(error: &str) -> Option<&'static str> {
     if error.contains("CertificateRequired") {
         return Some("the server requires a certificate: --cert and --key");
     }
-    // A server that requires a certificate may close the connection before the alert that says so arrives.
-    if ["broken pipe", "operation was canceled", "transport error"].iter().any(|part| error.contains(part)) {
+    if ["CertificateUnknown", "CertificateExpired", "UnknownCA", "BadCertificate"]
+        .iter()
+        .any(|part| error.contains(part))
+    {
         return Some(
-            "the connection has ended: the server has stopped, requires a certificate (--cert and --key), or has another \
-             port for gRPC",
+            "the server does not accept the certificate of --cert: its own CA must have signed it, and it must be valid now",
+        );
+    }
+    // A server that refuses a client may close the connection before the alert that says why arrives.
+    let ended = ["connection closed", "broken pipe", "operation was canceled", "transport error"];
+    if ended.iter().any(|part| error.contains(part)) {
+        return Some(
+            "the connection has ended: the server has stopped, requires a certificate (--cert and --key) or does not \
+             accept this one, or has another port for gRPC",
         );
     }
     let has_no_map = error.contains("no map");
@@ -117,6 +126,10 @@ mod tests {
         assert!(advice("no clearway server answers at http://localhost:1: Connection refused").is_none());
         let error = "no clearway server answers at https://localhost:1: received fatal alert: CertificateRequired";
         assert!(advice(error).unwrap().contains("--cert and --key"));
+        let error = "no clearway server answers at https://localhost:1: received fatal alert: CertificateUnknown";
+        assert!(advice(error).unwrap().contains("does not accept the certificate"));
+        let error = "no clearway server answers at https://localhost:1: connection closed";
+        assert!(advice(error).unwrap().contains("does not accept this one"));
         let error = "no clearway server answers at http://localhost:1: stream closed because of a broken pipe";
         assert!(advice(error).unwrap().contains("the server has stopped"));
     }
