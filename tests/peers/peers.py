@@ -17,7 +17,7 @@ the milliseconds, median of the ratios to Patchwork++ in the same round) and rat
 | travel | ground points (PyPI travel-seg) |
 | velodyne-decoder | packets of a simulated revolution of an HDL-64E -> points (PyPI velodyne-decoder) |
 | clearway STAGE | see tests/src/bin/stages.rs; `all` is decode + maps + encode |
-| clearway LAYER, its share | what a map of six layers takes for this one, and a sixth of what they have in common |
+| clearway LAYER, its share | the layer alone, with a sixth of `shared`, which a map of six layers does once |
 
 The packages are installed into an environment below --venv, which is made at the first run.
 """
@@ -48,7 +48,8 @@ WARM_UP = 6
 # Shares of the points of a scan, for the plot of cost against points.
 SHARES = [1.0, 0.5, 0.25, 0.125]
 # The ratios to Patchwork++ that Clearway aims at, greatest allowed.
-TARGETS = {"all": 0.45, "drivability, its share": 0.08, "terrain, its share": 0.2, "occupancy_six_units": 0.1}
+SHARE = ", its share"
+TARGETS = {"all": 0.45, f"drivability{SHARE}": 0.08, f"terrain{SHARE}": 0.2, "occupancy_six_units": 0.1}
 # How much faster than velodyne-decoder Clearway aims to decode.
 DECODE_TARGET = 5
 
@@ -170,15 +171,10 @@ def summarise(rows):
 
 
 def shares(programs):
-    """Milliseconds of each layer in a map of all of them: its own, and its share of what the layers have in common.
-
-    They take the place of the maps without one of the layers.
-    """
-    without = "clearway without_"
-    layers = [program.removeprefix(without) for program in programs if program.startswith(without)]
-    own = {layer: programs["clearway maps"] - programs.pop(without + layer) for layer in layers}
-    common = programs["clearway maps"] - sum(own.values())
-    return {f"clearway {layer}, its share": milliseconds + common / len(own) for layer, milliseconds in own.items()}
+    """Milliseconds of the layers with a target, each with its share of what a map does once for six layers."""
+    common = programs["clearway shared"]
+    layers = [target.removesuffix(SHARE) for target in TARGETS if target.endswith(SHARE)]
+    return {f"clearway {layer}{SHARE}": programs[f"clearway {layer}"] - common * 5 / 6 for layer in layers}
 
 
 def draw(summary, out):

@@ -12,7 +12,7 @@
 //! | a layer | a scan event -> a map of that layer alone, with its ground and reach | see [`Floor`] |
 //! | occupancy_six_units | the scans of six sensors in 100 ms -> the layer | |
 //! | maps | a scan event -> a map of all six layers | |
-//! | without_LAYER | a scan event -> a map of the five other layers | |
+//! | shared | a scan -> its points, their ground and reach: what all layers have in common | |
 //! | encode | a map of six layers -> the bytes of each, with all channels | the runs of six grids of 160,000 cells |
 //!
 //! The first rounds, in which buffers get their sizes, are not counted.
@@ -21,19 +21,24 @@ use std::collections::BTreeMap;
 use std::hint::black_box;
 use std::io::{BufRead, stdin};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use clap::Parser;
 use clearway::encode::EncodedMap;
+use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::{Sensor, SensorConfig as LidarConfig};
 use clearway_mapping::config::{Extrinsics, MapsConfig, OccupancyConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
+use clearway_mapping::ground::Ground;
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
 use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::reach::Reach;
+use clearway_mapping::reach::config::ReachConfig;
 use clearway_mapping::scan_file;
-use clearway_mapping::sensor::sweep::Sweep;
+use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::traffic;
@@ -119,13 +124,14 @@ struct Stages {
     /// A pipeline for each stage that makes maps, by name.
     pipelines: BTreeMap<&'static str, Pipeline>,
     six_units: SixUnits,
+    shared: Shared,
     floor: Floor,
     /// Number of runs so far: the stamps of a stage rise.
     runs: i64,
 }
 
 impl Stages {
-    const NAMES: [&'static str; 16] = [
+    const NAMES: [&'static str; 11] = [
         "decode",
         "drivability",
         "height_difference",
@@ -134,13 +140,8 @@ impl Stages {
         "speed",
         "safe_path",
         "occupancy_six_units",
+        "shared",
         "maps",
-        "without_drivability",
-        "without_height_difference",
-        "without_terrain",
-        "without_occupancy",
-        "without_speed",
-        "without_safe_path",
         "encode",
     ];
 
@@ -157,17 +158,17 @@ impl Stages {
             }
             None => (Scan::from(&vehicle.revolution(1)), 1.9),
         };
-        let layers_of = |stage: &str| match stage.strip_prefix("without_") {
-            Some(without) => LAYERS.into_iter().filter(|layer| *layer != without).collect::<Vec<_>>(),
-            None if LAYERS.contains(&stage) => LAYERS.into_iter().filter(|layer| *layer == stage).collect(),
+        let layers_of = |stage: &str| match LAYERS.iter().find(|layer| **layer == stage) {
+            Some(alone) => vec![*alone],
             None => LAYERS.to_vec(),
         };
-        let of_maps = Self::NAMES.into_iter().filter(|stage| !["decode", "occupancy_six_units"].contains(stage));
+        let of_maps = LAYERS.into_iter().chain(["maps", "encode"]);
         Self {
             datagrams: datagrams.map(|datagram| datagram.payload.into()).collect(),
             decoder: Sensor::new(LidarConfig { model: Some(Model::Hdl64eS2), ..LidarConfig::default() }),
             pipelines: of_maps.map(|stage| (stage, pipeline(height_m, &layers_of(stage)))).collect(),
             six_units: SixUnits::new(),
+            shared: Shared::new(height_m),
             floor: Floor::new(&scan),
             scan,
             runs: 0,
@@ -190,6 +191,7 @@ impl Stages {
                 firings
             }),
             "occupancy_six_units" => timed(|| self.six_units.run()),
+            "shared" => timed(|| self.shared.run(&self.scan)),
             _ => {
                 let pipeline = self.pipelines.get_mut(name).unwrap_or_else(|| panic!("{name} is no stage"));
                 let event = |body| Event { sequence: 0, arrival_ns: stamp_ns, source: 0, body };
@@ -228,6 +230,34 @@ fn pipeline(height_m: f64, layers: &[&str]) -> Pipeline {
     let mut pipeline = Pipeline::new(&config, vec![None]).expect("the default configuration");
     pipeline.set_active_layers(|layer| layers.contains(&layer));
     pipeline
+}
+
+/// What all layers have in common: a scan's points, and once for each map their ground and reach.
+struct Shared {
+    calibration: Arc<Calibration>,
+    mount: Mount,
+    sweep: Sweep,
+    ground: Ground,
+    reach: Reach,
+}
+
+impl Shared {
+    fn new(height_m: f64) -> Self {
+        let config = ReachConfig::default();
+        Self {
+            calibration: Arc::new(Calibration::factory(Model::Hdl64eS2)),
+            mount: Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, height_m), range_m_min: 0.9 },
+            sweep: Sweep::default(),
+            ground: Ground::new(config.outline()),
+            reach: Reach::new(&config),
+        }
+    }
+
+    fn run(&mut self, scan: &Scan) {
+        self.sweep.set_scan(scan, &self.calibration, &self.mount);
+        self.ground.estimate(&self.sweep);
+        self.reach.update(&self.sweep, &self.ground);
+    }
 }
 
 /// Scans of 100 ms from six sensors on a vehicle in traffic ([`traffic::scans_of_six_units`]).
