@@ -21,7 +21,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use clearway_mapping::error::EventError;
-use clearway_mapping::event::{EgoPose, Event};
+use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use nalgebra::Vector3;
@@ -42,6 +42,19 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A function that is called with the pipeline after each event that completed a revolution.
 pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
+
+/// What a turn has taken so far.
+struct TurnWork {
+    time: WorkTime,
+    /// Rays of its scans, with a return or without.
+    rays: usize,
+}
+
+impl TurnWork {
+    fn start() -> Self {
+        Self { time: WorkTime::start(), rays: 0 }
+    }
+}
 
 /// One vehicle's engine before its thread runs.
 pub struct Engine {
@@ -77,15 +90,15 @@ impl Engine {
             }
             let _stopped = Stopped(self.status.clone());
             self.status.engine_beats();
-            let (mut turn, mut work) = (None, WorkTime::start());
+            let (mut turn, mut work) = (None, TurnWork::start());
             while let Some(queued) = self.next(&events, &mut turn) {
                 self.status.engine_beats();
                 turn = turn.or_else(|| {
-                    work = WorkTime::start();
+                    work = TurnWork::start();
                     Some(turns.wait())
                 });
                 let maps = self.maps();
-                self.step_in_turn(queued, work);
+                self.step_in_turn(queued, &mut work);
                 turn = turn.filter(|_| self.maps() == maps);
             }
         })
@@ -93,11 +106,14 @@ impl Engine {
 
     /// Handles one event in the calling thread.
     pub fn step(&mut self, queued: QueuedEvent) {
-        self.step_in_turn(queued, WorkTime::start());
+        self.step_in_turn(queued, &mut TurnWork::start());
     }
 
-    /// Handles one event; `work` is the time of a turn so far.
-    fn step_in_turn(&mut self, QueuedEvent { event, receipt, .. }: QueuedEvent, work: WorkTime) {
+    /// Handles one event of a turn.
+    fn step_in_turn(&mut self, QueuedEvent { event, receipt, .. }: QueuedEvent, work: &mut TurnWork) {
+        if let Body::Scan(scan) = &event.body {
+            work.rays += scan.x.len() + scan.no_returns.len();
+        }
         let outcome = self.step_event(&event, work);
         // After everything else: a client that receives the outcome finds the map published and counted.
         if let Some(receipt) = receipt {
@@ -171,7 +187,7 @@ impl Engine {
         }
     }
 
-    fn step_event(&mut self, event: &Event, work: WorkTime) -> Result<(), EventError> {
+    fn step_event(&mut self, event: &Event, work: &TurnWork) -> Result<(), EventError> {
         if let Some(recording) = &mut self.recording {
             recording.record_event(event);
         }
@@ -192,8 +208,8 @@ impl Engine {
     }
 
     /// Encodes the newest map and gives it to readers, recorder and observer. Its computation `began` after its event
-    /// had `waited`; `work` is what its turn has taken so far. Both are `None` if no event made the map.
-    fn publish(&mut self, began: Instant, work: Option<WorkTime>, waited: Option<Duration>) {
+    /// had `waited`; `work` is that of its turn so far. Both are `None` if no event made the map.
+    fn publish(&mut self, began: Instant, work: Option<&TurnWork>, waited: Option<Duration>) {
         let computed = began.elapsed();
         let Some(map) = self.pipeline.newest_map() else { return };
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
@@ -204,7 +220,8 @@ impl Engine {
         });
         let encoding = began.elapsed().saturating_sub(computed);
         if let Some(work) = work {
-            self.status.map_time.record(self.pipeline.newest_sweep().x.len(), work.worked());
+            let points = self.pipeline.newest_sweep().x.len().max(work.rays);
+            self.status.map_time.record(points, work.time.worked());
         }
         let speed_m_s = map.speed_mps;
         // The points come before the map, so that a reader of the map finds its points.

@@ -13,7 +13,7 @@ use tokio::sync::{Semaphore, watch};
 
 use super::observation::{self, Bodies, Limits, ObservationError};
 use super::queue::EventQueue;
-use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, Receipt, ScanTime};
+use super::receipt::{ClientSession, EngineTime, ObservationId, Outcome, OutcomeSender, Receipt};
 use super::stream_places::{StreamLimitError, StreamPlace, StreamPlaces};
 use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::base::sync::locked;
@@ -35,7 +35,7 @@ pub struct Gateway {
     map_time: Arc<MapTime>,
     /// Longest time that a map of scans may take.
     map_time_max: Duration,
-    /// The time that the maps of waiting scans take, in microseconds: at most `map_time_max`.
+    /// The time that the maps of waiting points take, in microseconds: at most `map_time_max`.
     waiting_us: Arc<Semaphore>,
     queue: EventQueue,
 }
@@ -53,6 +53,8 @@ struct Sensors {
     newest_scans: BTreeMap<u16, (usize, i64)>,
 }
 
+/// Returns of a packet, at most: those of a Velodyne have 12 blocks of 32.
+const PACKET_RETURNS: usize = 384;
 /// A scan that is older has no part in the next map. Ours: two revolutions of the slowest sensor.
 const SCAN_AGE_NS_MAX: i64 = 400_000_000;
 
@@ -90,7 +92,7 @@ impl Gateway {
                 clients: BTreeMap::new(),
                 newest_scans: BTreeMap::new(),
             }),
-            streams: StreamPlaces::new(streams_max),
+            streams: StreamPlaces::new(streams_max, (streams_max / 4).max(1)),
             map_time,
             map_time_max,
             waiting_us: Arc::new(Semaphore::new(micros(map_time_max) as usize)),
@@ -106,17 +108,25 @@ impl Gateway {
         self.streams.take(sender)
     }
 
-    /// Waits until the scans before this observation leave the engine time for it, so that no map is late because
-    /// scans came faster than maps are made. Only a scan waits.
-    pub async fn wait_for_time(&self, observation: &v1::Observation) -> ScanTime {
-        let Some(v1::observation::Body::Scan(scan)) = &observation.body else { return ScanTime::default() };
-        let rays = scan.x.len() / size_of::<f32>() + scan.no_returns.len() / size_of::<[f32; 3]>();
-        let took = self.map_time.of(rays).min(self.map_time_max);
+    /// Waits until the points before this observation leave the engine time for it, so that no map is late because
+    /// points came faster than maps are made. Only a scan and packets wait.
+    pub async fn wait_for_time(&self, observation: &v1::Observation) -> EngineTime {
+        let takes = match &observation.body {
+            Some(v1::observation::Body::Scan(scan)) => {
+                let rays = scan.x.len() / size_of::<f32>() + scan.no_returns.len() / size_of::<[f32; 3]>();
+                self.map_time.of(rays)
+            }
+            Some(v1::observation::Body::Packets(packets)) => {
+                self.map_time.of_part(packets.lengths.len() / size_of::<u16>() * PACKET_RETURNS)
+            }
+            _ => return EngineTime::default(),
+        };
+        let took = takes.min(self.map_time_max);
         // The semaphore is never closed.
-        ScanTime(self.waiting_us.clone().acquire_many_owned(micros(took)).await.ok())
+        EngineTime(self.waiting_us.clone().acquire_many_owned(micros(took)).await.ok())
     }
 
-    /// Checks one observation of `bytes` bytes and pushes its events; a scan holds `time` until it is processed.
+    /// Checks one observation of `bytes` bytes and pushes its events; the last one holds `time` until it is processed.
     /// An immediate refusal goes to `session`; the outcome of each event goes to `outcomes`.
     ///
     /// # Errors
@@ -125,7 +135,7 @@ impl Gateway {
         &self,
         observation: v1::Observation,
         bytes: usize,
-        mut time: ScanTime,
+        mut time: EngineTime,
         session: &mut ClientSession,
         outcomes: &OutcomeSender,
     ) -> Result<(), UnknownNameError> {
@@ -164,9 +174,11 @@ impl Gateway {
                     Err(unknown) => return refuse(unknown, session),
                 };
                 session.begin(number, bodies.len(), bytes);
-                for (captured_ns, body) in bodies {
+                let last = bodies.len().saturating_sub(1);
+                for (at, (captured_ns, body)) in bodies.into_iter().enumerate() {
                     let id = ObservationId { client, number };
-                    let receipt = Receipt::new(id, std::mem::take(&mut time), outcomes);
+                    let time = if at == last { std::mem::take(&mut time) } else { EngineTime::default() };
+                    let receipt = Receipt::new(id, time, outcomes);
                     match body {
                         Body::Sensor(sensor) => {
                             self.push_declaration(captured_ns, sensor, receipt, &mut sensors, session);
@@ -191,8 +203,9 @@ impl Gateway {
         let newest = &mut locked(&self.sensors).newest_scans;
         newest.retain(|of, (_, came_ns)| *of != source && now_ns.saturating_sub(*came_ns) < SCAN_AGE_NS_MAX);
         let others = newest.values().map(|(points, _)| points).sum();
-        let takes = self.map_time.of(points.saturating_add(others));
-        if takes > self.map_time_max {
+        let all = points.saturating_add(others);
+        if !self.map_time.allows(all, self.map_time_max, now_ns) {
+            let takes = self.map_time.of(all);
             return Err(ObservationError::Time { points, others, takes, takes_max: self.map_time_max });
         }
         newest.insert(source, (points, now_ns));
@@ -299,8 +312,8 @@ fn concerns_vehicle(observation: &v1::Observation) -> bool {
 #[derive(Clone, Debug)]
 pub struct Gateways {
     all: Arc<[Arc<Gateway>]>,
-    /// A place for each stream of any vehicle, also for a stream that has not named its vehicle yet.
-    streams: StreamPlaces,
+    /// A place for each stream that has not named its vehicle yet.
+    unnamed: StreamPlaces,
     stop: watch::Receiver<bool>,
 }
 
@@ -308,8 +321,8 @@ impl Gateways {
     /// The gateways `all`; their streams end once `stop` is true.
     pub fn new(all: impl IntoIterator<Item = Gateway>, stop: watch::Receiver<bool>) -> Self {
         let all: Arc<[Arc<Gateway>]> = all.into_iter().map(Arc::new).collect();
-        let streams = StreamPlaces::new(all.iter().map(|gateway| gateway.streams.places()).sum());
-        Self { all, streams, stop }
+        let places: usize = all.iter().map(|gateway| gateway.streams.places()).sum();
+        Self { all, unnamed: StreamPlaces::new(places, places / 2), stop }
     }
 
     /// One gateway a vehicle.
@@ -326,12 +339,12 @@ impl Gateways {
         find_vehicle(&self.all, name, |gateway| &gateway.vehicle)
     }
 
-    /// A place for one stream of any vehicle.
+    /// A place for a stream until it has one of its vehicle.
     ///
     /// # Errors
     /// [`StreamLimitError`] if there is none for this sender.
-    pub fn take_stream(&self, sender: IpAddr) -> Result<StreamPlace, StreamLimitError> {
-        self.streams.take(sender)
+    pub fn take_unnamed_stream(&self, sender: IpAddr) -> Result<StreamPlace, StreamLimitError> {
+        self.unnamed.take(sender)
     }
 
     /// Length of the longest message that any vehicle allows, in bytes.
@@ -352,9 +365,12 @@ mod tests {
     use futures::FutureExt;
     use tokio::sync::mpsc::unbounded_channel;
 
+    use std::sync::atomic::Ordering;
+
     use super::*;
+    use crate::base::clock::Clock;
     use crate::config::Config;
-    use crate::ingest::queue::event_queue;
+    use crate::ingest::queue::{event_queue, event_queue_with_clock};
 
     fn scan(number: u64, points: usize) -> v1::Observation {
         let floats = pack(&vec![1.0_f32; points]);
@@ -381,11 +397,38 @@ mod tests {
         }
         let third = scan(3, 80_000);
         assert!(gateway.wait_for_time(&third).now_or_never().is_none(), "two scans of 10 ms wait for the engine");
+        // 38,400 returns, 3.8 ms.
+        let packets = v1::Packets { lengths: pack(&[1206_u16; 100]), ..Default::default() };
+        let packets = v1::observation::Body::Packets(packets);
+        let packets = v1::Observation { body: Some(packets), ..Default::default() };
+        assert!(gateway.wait_for_time(&packets).now_or_never().is_none());
         let pose = v1::observation::Body::EgoPose(v1::EgoPose::default());
         let pose = v1::Observation { body: Some(pose), ..Default::default() };
         assert!(gateway.wait_for_time(&pose).now_or_never().is_some(), "a pose takes no time");
         drop(events.recv().unwrap());
         assert!(gateway.wait_for_time(&third).now_or_never().is_some());
+    }
+
+    #[test]
+    fn after_slow_maps_one_scan_a_second_is_judged_as_before_the_first_map() {
+        let clock = Arc::new(std::sync::atomic::AtomicI64::new(0));
+        let now_ns = clock.clone();
+        let clock_of_queue = Clock::new(move || now_ns.load(Ordering::Relaxed));
+        let (queue, _events) = event_queue_with_clock(clock_of_queue, 16);
+        let map_time = Arc::<MapTime>::default();
+        let gateway = Gateway::new(&vehicle(40), &queue, map_time.clone());
+        let (outcomes, _reports) = unbounded_channel();
+        let mut session = ClientSession::new(0);
+        map_time.record(1_000, Duration::from_secs(1));
+        let mut is_pushed = |number, after_ms: i64| {
+            clock.store(after_ms * 1_000_000, Ordering::Relaxed);
+            gateway.push(scan(number, 100_000), 0, EngineTime::default(), &mut session, &outcomes).unwrap();
+            session.next_report().is_none_or(|report| report.refused.is_empty())
+        };
+        let pushed = [is_pushed(1, 0), is_pushed(2, 100), is_pushed(3, 999), is_pushed(4, 1000), is_pushed(5, 1100)];
+        assert_eq!(pushed, [true, false, false, true, false]);
+        map_time.record(100_000, Duration::from_millis(10));
+        assert!(is_pushed(6, 1200) && is_pushed(7, 1300), "it was fast");
     }
 
     #[test]
@@ -398,7 +441,7 @@ mod tests {
         let mut session = ClientSession::new(0);
         let mut push = |number, sensor: &str, points| {
             let observation = v1::Observation { sensor: sensor.into(), ..scan(number, points) };
-            gateway.push(observation, 0, ScanTime::default(), &mut session, &outcomes).unwrap();
+            gateway.push(observation, 0, EngineTime::default(), &mut session, &outcomes).unwrap();
             session.next_report().map(|report| report.refused).unwrap_or_default()
         };
         let refused = push(1, "top", 180_001).remove(0);

@@ -17,7 +17,7 @@ use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
 use super::gateway::{Gateway, Gateways};
-use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, ScanTime};
+use super::receipt::{ClientSession, EngineTime, ObservationId, Outcome, OutcomeSender};
 use super::stream_places::StreamPlace;
 use crate::publish::listen::Place;
 use crate::publish::listen::access::Caller;
@@ -53,26 +53,31 @@ impl IngestService for Ingest {
         &self,
         request: Request<Streaming<v1::Observation>>,
     ) -> Result<Response<Self::StreamStream>, Status> {
-        let full = |of: &str, error| Status::resource_exhausted(format!("{of}: {error}; close one first"));
+        let full = |of: &str, gateway: Option<&Arc<Gateway>>, error| {
+            gateway.inspect(|gateway| gateway.record_refusal("streams"));
+            Status::resource_exhausted(format!("{of}: {error}; close one first"))
+        };
         let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
         let sender =
             request.extensions().get::<Arc<Place>>().map_or(Ipv4Addr::UNSPECIFIED.into(), |place| place.host());
-        let place = self.gateways.take_stream(sender).map_err(|error| full("this server", error))?;
+        // What no vehicle is named for yet, the first one counts, so that one ledger has it.
+        let counts = self.gateways.all().first();
+        let unnamed = self.gateways.take_unnamed_stream(sender);
+        let unnamed = unnamed.map_err(|error| full("streams that have not named their vehicle", counts, error))?;
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
             .await
             .map_err(|_| Status::deadline_exceeded(format!("no observation within {OPENING_TIMEOUT:?}")))?;
-        // The vehicle of an unreadable observation is unknown: the first vehicle counts it, so that one ledger has it.
         let first = first.inspect_err(|status| {
-            let gateway = self.gateways.all().first().filter(|_| is_refusal(status));
-            gateway.inspect(|gateway| gateway.record_refusal("message"));
+            counts.filter(|_| is_refusal(status)).inspect(|gateway| gateway.record_refusal("message"));
         })?;
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let gateway = self.gateways.find(&first.vehicle)?.clone();
         caller.check_vehicle(&gateway.vehicle)?;
-        let of_vehicle =
-            gateway.take_stream(sender).map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
-        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), [place, of_vehicle]);
+        let place = gateway.take_stream(sender);
+        let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), Some(&gateway), error))?;
+        drop(unnamed);
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), place);
         if first.body.is_none() {
             stream.acknowledge_opening(&first);
         } else {
@@ -96,7 +101,7 @@ struct IngestStream {
     /// The status that ends the stream, after everything in flight is reported.
     end: Option<Status>,
     // The last field, so that it is dropped last.
-    _places: [StreamPlace; 2],
+    _place: StreamPlace,
 }
 
 impl IngestStream {
@@ -104,7 +109,7 @@ impl IngestStream {
         observations: Streaming<v1::Observation>,
         gateway: Arc<Gateway>,
         gateways: Gateways,
-        places: [StreamPlace; 2],
+        place: StreamPlace,
     ) -> Self {
         let (outcome_sender, outcomes) = unbounded_channel();
         Self {
@@ -116,7 +121,7 @@ impl IngestStream {
             outcome_sender,
             outcomes,
             end: None,
-            _places: places,
+            _place: place,
         }
     }
 
@@ -169,7 +174,7 @@ impl IngestStream {
         self.session.begin(first.number, 0, 0);
     }
 
-    fn push_waiting(&mut self, time: ScanTime) {
+    fn push_waiting(&mut self, time: EngineTime) {
         let Some(mut observation) = self.waiting.take() else { return };
         observation.client = 0;
         let bytes = observation.encoded_len();
@@ -197,7 +202,7 @@ fn is_refusal(status: &Status) -> bool {
 }
 
 /// The engine's time for an observation; for ever if there is none.
-async fn time_for(gateway: &Gateway, observation: Option<&v1::Observation>) -> ScanTime {
+async fn time_for(gateway: &Gateway, observation: Option<&v1::Observation>) -> EngineTime {
     match observation {
         Some(observation) => gateway.wait_for_time(observation).await,
         None => std::future::pending().await,

@@ -43,9 +43,9 @@ pub struct ObservationId {
 /// Where outcomes are sent. Unbounded, but it holds no more outcomes than there are events in flight.
 pub type OutcomeSender = UnboundedSender<(ObservationId, Outcome)>;
 
-/// The engine's time for a waiting scan, free again when this is dropped; `None` for an event that is no scan.
+/// The engine's time for waiting points, free again when this is dropped; `None` for an event without points.
 #[derive(Debug, Default)]
-pub struct ScanTime(pub Option<OwnedSemaphorePermit>);
+pub struct EngineTime(pub Option<OwnedSemaphorePermit>);
 
 /// Delivers the outcome of one event exactly once. A receipt that is dropped undelivered, for example with the queue of
 /// a stopped engine, delivers a refusal with the reason `stopped`.
@@ -53,12 +53,12 @@ pub struct ScanTime(pub Option<OwnedSemaphorePermit>);
 pub struct Receipt {
     id: ObservationId,
     outcomes: Option<OutcomeSender>,
-    _time: ScanTime,
+    _time: EngineTime,
 }
 
 impl Receipt {
     /// A receipt for one event of the observation `id`, which holds `time` until then.
-    pub fn new(id: ObservationId, time: ScanTime, outcomes: &OutcomeSender) -> Self {
+    pub fn new(id: ObservationId, time: EngineTime, outcomes: &OutcomeSender) -> Self {
         Self { id, outcomes: Some(outcomes.clone()), _time: time }
     }
 
@@ -287,8 +287,8 @@ mod tests {
     fn a_receipt_that_is_dropped_delivers_that_the_engine_has_stopped() {
         let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
         let id = ObservationId { client: 1, number: 2 };
-        drop(Receipt::new(id, ScanTime::default(), &sender));
-        Receipt::new(id, ScanTime::default(), &sender).deliver(Outcome::Accepted);
+        drop(Receipt::new(id, EngineTime::default(), &sender));
+        Receipt::new(id, EngineTime::default(), &sender).deliver(Outcome::Accepted);
         assert!(matches!(outcomes.try_recv(), Ok((of, Outcome::Refused { reason: "stopped", .. })) if of == id));
         assert_eq!(outcomes.try_recv(), Ok((id, Outcome::Accepted)));
         assert!(outcomes.try_recv().is_err(), "each is delivered once");

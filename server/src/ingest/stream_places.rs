@@ -1,4 +1,4 @@
-//! Places for the streams of senders: so many at once, and one sender never has all of them.
+//! Places for the streams of senders: so many at once, of which some are kept from each sender for the others.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -10,6 +10,8 @@ use crate::base::sync::locked;
 #[derive(Clone, Debug)]
 pub struct StreamPlaces {
     places: usize,
+    /// Number of places that one sender never has.
+    kept: usize,
     /// Open streams, by what counts as one sender.
     open: Arc<Mutex<BTreeMap<IpAddr, usize>>>,
 }
@@ -31,7 +33,7 @@ pub enum StreamLimitError {
         places: usize,
     },
     /// The sender has as many as one may have.
-    #[error("{sender} has {streams} of {places} streams open, and one is kept for another sender")]
+    #[error("{sender} has {streams} of {places} streams open, and the others are kept for other senders")]
     OfSender {
         /// The sender.
         sender: IpAddr,
@@ -43,9 +45,9 @@ pub enum StreamLimitError {
 }
 
 impl StreamPlaces {
-    /// So many places, all free.
-    pub fn new(places: usize) -> Self {
-        Self { places, open: Arc::default() }
+    /// So many places, all free, of which a sender never has `kept`; the only place is for everyone.
+    pub fn new(places: usize, kept: usize) -> Self {
+        Self { places, kept: kept.min(places.saturating_sub(1)), open: Arc::default() }
     }
 
     /// Number of places, free or not.
@@ -53,8 +55,7 @@ impl StreamPlaces {
         self.places
     }
 
-    /// A place for a stream of this sender. The last place is for a sender that is not the only one, unless there is
-    /// but one.
+    /// A place for a stream of this sender.
     ///
     /// # Errors
     /// [`StreamLimitError`] if there is none for it.
@@ -65,7 +66,7 @@ impl StreamPlaces {
             return Err(StreamLimitError::All { places });
         }
         let streams = open.entry(sender).or_default();
-        if *streams + 1 >= places && places > 1 {
+        if *streams + self.kept >= places {
             return Err(StreamLimitError::OfSender { sender, streams: *streams, places });
         }
         *streams += 1;
@@ -91,7 +92,7 @@ mod tests {
     #[test]
     fn one_sender_never_has_all_places() {
         let (a, b): (IpAddr, IpAddr) = ("10.0.0.1".parse().unwrap(), "10.0.0.2".parse().unwrap());
-        let places = StreamPlaces::new(3);
+        let places = StreamPlaces::new(3, 1);
         let mut held: Vec<_> = (0..2).map(|_| places.take(a).unwrap()).collect();
         assert_eq!(places.take(a).unwrap_err(), StreamLimitError::OfSender { sender: a, streams: 2, places: 3 });
         held.push(places.take(b).unwrap());
@@ -102,6 +103,6 @@ mod tests {
         assert!(places.take(b).is_ok(), "the place of a dropped stream is free again");
         drop(held);
         assert!(locked(&places.open).is_empty());
-        assert!(StreamPlaces::new(1).take(a).is_ok(), "the only place is for everyone");
+        assert!(StreamPlaces::new(1, 1).take(a).is_ok(), "the only place is for everyone");
     }
 }

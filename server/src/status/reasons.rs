@@ -22,7 +22,7 @@ pub const PACKET_REASONS: [&str; 18] = [
     "telemetry",
 ];
 /// Reasons for which messages are no observations.
-pub const OBSERVATION_REASONS: [&str; 14] = [
+pub const OBSERVATION_REASONS: [&str; 15] = [
     "body",
     "columns",
     "message",
@@ -37,6 +37,7 @@ pub const OBSERVATION_REASONS: [&str; 14] = [
     "ros_message",
     "scan_time",
     "stamp_ahead",
+    "streams",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.
 pub const CLOSE_REASONS: [&str; 12] = [
