@@ -205,6 +205,12 @@ impl Reach {
         cell.index().is_some_and(|cell| self.closed.get(cell % SIDE, cell / SIDE))
     }
 
+    /// True if the ground of a cell was seen: if a return of it is too low for an obstacle.
+    #[inline(always)]
+    pub fn has_ground(&self, cell: ReachCell) -> bool {
+        cell.index().is_some_and(|cell| self.steps.low_mm(cell) != i16::MAX)
+    }
+
     /// True if the vehicle can get to a cell: if the disc covers it somewhere on its path.
     #[inline(always)]
     pub fn is_reached(&self, cell: ReachCell) -> bool {
