@@ -6,7 +6,7 @@
 //! one too far below it a mirror image, and the next lowest return is tried.
 
 use super::plane::NearPlane;
-use super::polar::{CELLS, COLUMNS, PolarCells, ROWS, beside, column_directions, row_start_m};
+use super::polar::{CELLS, COLUMNS, PolarCells, ROWS, Return, beside, column_directions, row_start_m};
 
 /// Weight of the columns beside, from two clockwise to two counter-clockwise. Ours; tuned on the scenes of
 /// BENCHMARKS.md, as are all constants of this file.
@@ -28,6 +28,12 @@ const HEIGHT_SHARE: f32 = 0.6;
 const SLOPE_SHARE: f32 = 0.4;
 /// Steepest slope of a column.
 const SLOPE_MAX: f32 = 0.25;
+/// Least gap before the first return of rising ground, metres: over a shorter one a step is not told from a slope.
+/// Largest gap, as a share of its outer range, as in the surface. Least share of its rise that the next return keeps.
+/// Ours; tuned on the even seeds of the random worlds.
+const RISING_GAP_M_MIN: f32 = 1.0;
+const RISING_GAP_SHARE: f32 = 0.44;
+const RISE_KEPT: f32 = 0.8;
 /// Largest height of ground over or under the plane z = 0 if no near ground was seen, metres. Ours; not tuned.
 const LEVEL_M: f32 = 0.2;
 /// Number of times each row is grown; all but the first also reach ground behind objects from the columns beside.
@@ -143,13 +149,37 @@ impl Growth {
             let distance_m = distance_m.min(most);
             let over_m = point.z_m - predicted_m;
             if over_m > above[0] + above[1] * distance_m {
-                return Outcome::Obstacle;
+                if with_object || !self.rises(cell, point, cells) {
+                    return Outcome::Obstacle;
+                }
+                // The rise is confirmed, so that the height needs no filter.
+                let Return { range_m, z_m } = point;
+                return Outcome::Ground { range_m, z_m, with_object, predicted_m: z_m };
             }
             if over_m >= -(BELOW_M[0] + BELOW_M[1] * distance_m) {
                 return Outcome::Ground { range_m: point.range_m, z_m: point.z_m, with_object, predicted_m };
             }
         }
         Outcome::Nothing
+    }
+
+    /// True if a return above the prediction is the first one of rising ground: if the next return of its column
+    /// continues the rise from the ground before it. The next return of a wall lies over it, that behind a kerb on a
+    /// level with it, and that behind a hedge or a car lower.
+    fn rises(&self, cell: usize, point: Return, cells: &PolarCells) -> bool {
+        let front = &self.fronts[cell % COLUMNS];
+        let gap_m = point.range_m - front.range_m;
+        if front.is_blocked || gap_m < RISING_GAP_M_MIN {
+            return false;
+        }
+        let mut outward = (cell + COLUMNS..CELLS).step_by(COLUMNS);
+        let Some(next) = outward.find_map(|outer| cells.lowest(outer).next()) else { return false };
+        let run_m = next.range_m - point.range_m;
+        let rise = (point.z_m - front.height_m) / gap_m;
+        let next_rise = (next.z_m - point.z_m) / run_m;
+        gap_m.max(run_m) <= RISING_GAP_SHARE * next.range_m
+            && (RISE_KEPT * rise..=SLOPE_MAX).contains(&next_rise)
+            && rise <= SLOPE_MAX
     }
 
     /// Height expected at a range of a column, and the distance to the nearest ground, metres.
