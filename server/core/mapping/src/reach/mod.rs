@@ -205,10 +205,12 @@ impl Reach {
         cell.index().is_some_and(|cell| self.closed.get(cell % SIDE, cell / SIDE))
     }
 
-    /// True if the ground of a cell was seen: if a return of it is too low for an obstacle.
-    #[inline(always)]
-    pub fn has_ground(&self, cell: ReachCell) -> bool {
-        cell.index().is_some_and(|cell| self.steps.low_mm(cell) != i16::MAX)
+    /// True if the vehicle can get to a cell whose ground was seen, and no cell beside it is closed.
+    pub fn is_open_ground(&self, cell: ReachCell) -> bool {
+        let Some(cell) = cell.index().filter(|cell| self.steps.low_mm(*cell) != i16::MAX) else { return false };
+        let (ix, iy) = (cell % SIDE, cell / SIDE);
+        let near = |index: usize| index.saturating_sub(2)..(index + 3).min(SIDE);
+        self.flood.is_reached(ix, iy) && !near(iy).any(|iy| near(ix).any(|ix| self.closed.get(ix, iy)))
     }
 
     /// True if the vehicle can get to a cell: if the disc covers it somewhere on its path.

@@ -150,7 +150,7 @@ impl FreeSpace {
         for (state, &cell) in self.states.iter_mut().zip(&self.reach_cell) {
             *state = match *state {
                 _ if reach.is_closed(cell) => State::Obstacle,
-                State::Obstacle | State::Unknown if reach.has_ground(cell) && reach.is_reached(cell) => State::Drivable,
+                State::Obstacle | State::Unknown if reach.is_open_ground(cell) => State::Drivable,
                 // The obstacle stands in another part of the radial cell.
                 State::Obstacle => State::Unknown,
                 free if free.is_free() && !reach.is_reached(cell) => State::NotReached,
