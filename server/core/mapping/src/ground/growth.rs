@@ -231,3 +231,52 @@ impl Growth {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::polar::PolarIndex;
+    use super::*;
+    use crate::sensor::sweep::Sweep;
+    use crate::vehicle_outline::Outline;
+
+    /// The heights of the ground at these ranges ahead, for level ground up to 12 m and rings of these ranges and
+    /// heights beyond.
+    fn ground_m<const RINGS: usize>(beyond: [[f32; 2]; RINGS]) -> [f32; RINGS] {
+        let mut sweep = Sweep::default();
+        for [range_m, z_m] in (3..=12).map(|range_m| [range_m as f32, 0.0]).chain(beyond) {
+            for degree in 0..360 {
+                let (sin, cos) = libm::sincosf((degree as f32 + 0.5).to_radians());
+                sweep.x.push(range_m * cos);
+                sweep.y.push(range_m * sin);
+                sweep.z.push(z_m);
+            }
+        }
+        let (mut cells, mut growth) =
+            (PolarCells::new(Outline { width_m: 2.0, front_m: 3.0, rear_m: 2.0 }), Growth::default());
+        cells.sort_points(&sweep);
+        growth.grow(&cells, &NearPlane { abc: [0.0; 3], is_seen: true });
+        beyond.map(|[range_m, _]| growth.heights_m()[PolarIndex::at(range_m, 0.1).index().unwrap()])
+    }
+
+    #[test]
+    fn the_first_ring_on_rising_ground_is_ground_if_the_next_continues_the_rise() {
+        for slope in [0.08, 0.12, 0.2] {
+            let rings = [18.0, 21.0, 24.0].map(|range_m| [range_m, slope * (range_m - 12.0)]);
+            for (found, [range_m, z_m]) in ground_m(rings).into_iter().zip(rings) {
+                assert!((found - z_m).abs() < 0.15, "{slope}: {found} at {range_m} m");
+            }
+        }
+    }
+
+    #[test]
+    fn a_ring_above_level_ground_is_an_object_unless_the_next_continues_the_rise() {
+        let is_ground = |next: [f32; 2]| !ground_m([[18.0, 0.8], next])[0].is_nan();
+        assert!(is_ground([21.0, 1.2]), "a hill");
+        assert!(!is_ground([21.0, 0.8]), "a bed");
+        assert!(!is_ground([25.0, 0.0]), "a hedge, and the ground behind it");
+        assert!(!is_ground([19.5, 1.6]), "a face");
+        assert!(!is_ground([50.0, 4.5]), "a ring too far away");
+        assert!(ground_m([[18.0, 0.8]])[0].is_nan(), "no next ring");
+        assert!(ground_m([[18.0, 2.0], [21.0, 2.7]])[0].is_nan(), "steeper than any road");
+    }
+}

@@ -181,4 +181,24 @@ mod tests {
         assert_eq!(marked(&steps, ([5.1, 4.6], 0.4), far), 40, "a kerb");
         assert_eq!(marked(&steps, ([5.1, 5.1], 1.0), far), 40, "apart from the step");
     }
+
+    #[test]
+    fn ground_high_over_the_plane_is_closed_where_it_is_the_nearest_that_was_seen() {
+        // Cells with ground: all beyond this range.
+        let marked = |from_m: f32, over_plane_m: f32| {
+            let middles_m = row_middles_m();
+            let seen = |polar: usize| middles_m[polar / COLUMNS] > from_m;
+            let confidence = |polar| if seen(polar) { Confidence::Seen } else { Confidence::Bridged };
+            let confidences: Vec<Confidence> = (0..CELLS).map(confidence).collect();
+            let mut found = Vec::new();
+            let over_m = |[_, y]: [f32; 2]| if y > 4.0 { over_plane_m } else { 0.0 };
+            BlindZone::new().find_rises(over_m, &confidences, |ix, iy| found.push(centre_m(iy * SIDE + ix)));
+            found
+        };
+        let bed = marked(5.0, 0.4);
+        assert!(bed.len() >= 40 && bed.iter().all(|[x, y]| *y > 3.8 && libm::hypotf(*x, *y) < 6.0), "{bed:?}");
+        assert_eq!(marked(5.0, 0.1), [[0.0; 2]; 0], "a rise that the vehicle climbs");
+        assert_eq!(marked(5.0, -0.4), [[0.0; 2]; 0], "lower ground");
+        assert_eq!(marked(13.0, 0.4), [[0.0; 2]; 0], "too far away");
+    }
 }

@@ -294,6 +294,9 @@ fn mark_along(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ground::Ground;
+    use crate::reach::Reach;
+    use crate::reach::config::ReachConfig;
 
     #[test]
     fn a_hole_is_closed_exactly_if_it_is_as_narrow_as_configured() {
@@ -316,5 +319,33 @@ mod tests {
                 assert_eq!(marked(hole, width_m * 0.99), 0, "{width_m} m");
             }
         }
+    }
+
+    #[test]
+    fn ground_with_a_return_is_free_though_an_obstacle_stands_elsewhere_in_its_radial_cell() {
+        let config = ReachConfig::default();
+        let (mut ground, mut reach) = (Ground::new(config.outline()), Reach::new(&config));
+        let mut sweep = Sweep { mount_height_m: 1.9, ..Sweep::default() };
+        // A return in the middle of each cell, but in a strip; a pole at (10, 5).
+        let middles = (0..160).map(|index| centre_m(index, 160, 0.25));
+        let is_unseen = |x: f32| (6.0..6.5).contains(&x);
+        for (x, y) in middles.clone().flat_map(|x| middles.clone().map(move |y| (x, y))).filter(|(x, _)| !is_unseen(*x))
+        {
+            for z in [0.0, 0.6, 1.2].into_iter().take(if (x - 10.1).abs() + (y - 5.1).abs() < 0.1 { 3 } else { 1 }) {
+                sweep.x.push(x);
+                sweep.y.push(y);
+                sweep.z.push(z);
+            }
+        }
+        ground.estimate(&sweep);
+        reach.update(&sweep, &ground);
+        let mut space = FreeSpace::new(160, 0.25);
+        space.states.fill(State::Obstacle);
+        space.add_obstacles(&Context { reach: Some(&reach), ..Context::default() });
+        let state = |x: f32, y: f32| space.states[(y * 4.0 + 80.0) as usize * 160 + (x * 4.0 + 80.0) as usize];
+        assert_eq!(state(10.1, 5.1), State::Obstacle, "the pole");
+        assert_eq!([state(10.6, 5.1), state(9.6, 4.6)], [State::Unknown; 2], "beside the pole");
+        assert_eq!([state(10.9, 5.1), state(9.1, 4.4)], [State::Drivable; 2], "three cells from the pole");
+        assert_eq!(state(6.1, 5.1), State::Unknown, "no return");
     }
 }
