@@ -208,7 +208,8 @@ impl Reach {
         cell.index().is_some_and(|cell| self.closed.get(cell % SIDE, cell / SIDE))
     }
 
-    /// True if the vehicle can get to a cell whose ground was seen, and no cell beside it is closed.
+    /// True if the vehicle can get to a cell whose ground was seen, and no cell within half a metre of it is closed: the
+    /// foot of a bank or of a bush looks like ground.
     pub fn is_open_ground(&self, cell: ReachCell) -> bool {
         let Some(cell) = cell.index().filter(|cell| self.steps.low_mm(*cell) != i16::MAX) else { return false };
         let (ix, iy) = (cell % SIDE, cell / SIDE);

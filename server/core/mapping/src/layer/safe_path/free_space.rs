@@ -2,8 +2,9 @@
 //!
 //! In: the layers `drivability`, radial, and `occupancy`, the sweep, and what the vehicle can reach. Out: a [`State`]
 //! for each cell: the state of the radial cell in which the cell's centre lies, unless an obstacle stands in the cell
-//! or the vehicle cannot reach it. A radial cell with returns only from the vehicle's own outline (its bonnet) is
-//! unknown. Unseen ground is not free, with two exceptions:
+//! or the vehicle cannot reach it. Rows of the radial grid are metres long far away: where the radial cell is unknown or
+//! an obstacle, a cell that the vehicle reaches is drivable if its own ground was seen apart from what is closed. A
+//! radial cell with returns only from the vehicle's own outline (its bonnet) is unknown. Unseen ground is not free, with two exceptions:
 //! - The blind zone: if the innermost seen cell of a column is drivable and begins within the zone, the ground nearer
 //!   to the vehicle, which no laser reaches, is assumed to be free too, as the UT Austin thesis assumes when segments
 //!   grow from the vehicle (section IV.3).
