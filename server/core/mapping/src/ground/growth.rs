@@ -6,7 +6,7 @@
 //! one too far below it a mirror image, and the next lowest return is tried.
 
 use super::plane::NearPlane;
-use super::polar::{CELLS, COLUMNS, PolarCells, ROWS, beside, column_directions, row_start_m};
+use super::polar::{CELLS, COLUMNS, PolarCells, ROWS, Return, beside, column_directions, row_start_m};
 
 /// Weight of the columns beside, from two clockwise to two counter-clockwise. Ours; tuned on the scenes of
 /// BENCHMARKS.md, as are all constants of this file.
@@ -28,6 +28,13 @@ const HEIGHT_SHARE: f32 = 0.6;
 const SLOPE_SHARE: f32 = 0.4;
 /// Steepest slope of a column.
 const SLOPE_MAX: f32 = 0.25;
+/// Least gap before the first return of rising ground, metres: over a shorter one a step is not told from a slope.
+/// Largest gap, as a share of its outer range, as in the surface. Number of next returns that continue the rise, and
+/// least share of it that they keep. Ours; tuned on the even seeds of the random worlds.
+const RISING_GAP_M_MIN: f32 = 1.0;
+const RISING_GAP_SHARE: f32 = 0.44;
+const RISING_RETURNS: usize = 2;
+const RISE_KEPT: f32 = 0.8;
 /// Largest height of ground over or under the plane z = 0 if no near ground was seen, metres. Ours; not tuned.
 const LEVEL_M: f32 = 0.2;
 /// Number of times each row is grown; all but the first also reach ground behind objects from the columns beside.
@@ -143,13 +150,41 @@ impl Growth {
             let distance_m = distance_m.min(most);
             let over_m = point.z_m - predicted_m;
             if over_m > above[0] + above[1] * distance_m {
-                return Outcome::Obstacle;
+                if with_object || !self.rises(cell, point, cells) {
+                    return Outcome::Obstacle;
+                }
+                // The rise is confirmed, so that the height needs no filter.
+                let Return { range_m, z_m } = point;
+                return Outcome::Ground { range_m, z_m, with_object, predicted_m: z_m };
             }
             if over_m >= -(BELOW_M[0] + BELOW_M[1] * distance_m) {
                 return Outcome::Ground { range_m: point.range_m, z_m: point.z_m, with_object, predicted_m };
             }
         }
         Outcome::Nothing
+    }
+
+    /// True if a return above the prediction is the first one of rising ground: if the next returns of its column
+    /// continue the rise from the ground before it. The next return of a wall lies over it, that behind a kerb on a
+    /// level with it, and that behind a hedge or a car lower. Two returns count, because one behind a fence may lie on
+    /// the line through one of its slats by chance.
+    fn rises(&self, cell: usize, point: Return, cells: &PolarCells) -> bool {
+        let front = &self.fronts[cell % COLUMNS];
+        let gap_m = point.range_m - front.range_m;
+        let rise = (point.z_m - front.height_m) / gap_m;
+        let is_gap = gap_m >= RISING_GAP_M_MIN && gap_m <= RISING_GAP_SHARE * point.range_m;
+        if front.is_blocked || !is_gap || rise > SLOPE_MAX {
+            return false;
+        }
+        let mut outward = (cell + COLUMNS..CELLS).step_by(COLUMNS).filter_map(|outer| cells.lowest(outer).next());
+        let mut last = point;
+        (0..RISING_RETURNS).all(|_| {
+            let Some(next) = outward.next() else { return false };
+            let run_m = next.range_m - last.range_m;
+            let slope = (next.z_m - last.z_m) / run_m;
+            last = next;
+            run_m <= RISING_GAP_SHARE * next.range_m && (RISE_KEPT * rise..=SLOPE_MAX).contains(&slope)
+        })
     }
 
     /// Height expected at a range of a column, and the distance to the nearest ground, metres.
@@ -199,5 +234,56 @@ impl Growth {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::polar::PolarIndex;
+    use super::*;
+    use crate::sensor::sweep::Sweep;
+    use crate::vehicle_outline::Outline;
+
+    /// The heights of the ground at these ranges ahead, for level ground up to 12 m and rings of these ranges and
+    /// heights beyond.
+    fn ground_m<const RINGS: usize>(beyond: [[f32; 2]; RINGS]) -> [f32; RINGS] {
+        let mut sweep = Sweep::default();
+        for [range_m, z_m] in (3..=12).map(|range_m| [range_m as f32, 0.0]).chain(beyond) {
+            for degree in 0..360 {
+                let (sin, cos) = libm::sincosf((degree as f32 + 0.5).to_radians());
+                sweep.x.push(range_m * cos);
+                sweep.y.push(range_m * sin);
+                sweep.z.push(z_m);
+            }
+        }
+        let (mut cells, mut growth) =
+            (PolarCells::new(Outline { width_m: 2.0, front_m: 3.0, rear_m: 2.0 }), Growth::default());
+        cells.sort_points(&sweep);
+        growth.grow(&cells, &NearPlane { abc: [0.0; 3], is_seen: true });
+        beyond.map(|[range_m, _]| growth.heights_m()[PolarIndex::at(range_m, 0.1).index().unwrap()])
+    }
+
+    #[test]
+    fn the_first_ring_on_rising_ground_is_ground_if_the_next_two_continue_the_rise() {
+        for slope in [0.08, 0.12, 0.2] {
+            let rings = [18.0, 21.0, 24.0, 28.0].map(|range_m| [range_m, slope * (range_m - 12.0)]);
+            for (found, [range_m, z_m]) in ground_m(rings).into_iter().zip(rings) {
+                assert!((found - z_m).abs() < 0.15, "{slope}: {found} at {range_m} m");
+            }
+        }
+    }
+
+    #[test]
+    fn a_ring_above_level_ground_is_an_object_unless_the_next_two_continue_the_rise() {
+        let is_ground = |next: [[f32; 2]; 2]| !ground_m([[18.0, 0.8], next[0], next[1]])[0].is_nan();
+        let (hill, later) = ([21.0, 1.2], [24.0, 1.6]);
+        assert!(is_ground([hill, later]), "a hill");
+        assert!(!is_ground([[21.0, 0.8], [24.0, 0.8]]), "a bed");
+        assert!(!is_ground([[25.0, 0.0], [32.0, 0.0]]), "a hedge, and the ground behind it");
+        assert!(!is_ground([[19.5, 1.6], [21.0, 2.4]]), "a face");
+        assert!(!is_ground([hill, [24.0, 1.2]]), "a slat, and level ground behind it");
+        assert!(!is_ground([hill, [50.0, 4.5]]), "a ring too far away");
+        assert!(ground_m([[18.0, 0.8], hill])[0].is_nan(), "one next ring");
+        assert!(ground_m([[18.0, 2.0], [21.0, 2.7], [24.0, 3.4]])[0].is_nan(), "steeper than any road");
     }
 }
