@@ -35,9 +35,9 @@ use safe_points::Follower;
 const SIZE_M: [f64; 3] = [4.4, 1.8, 1.5];
 /// Distance of the goal along the route, in metres.
 const GOAL_M: f64 = 10.0;
-/// Least distance that a drive must keep from all things, in metres. Ours: the planner keeps 0.2 and 0.3 m in its two
-/// drives, the follower 0.2 and 0.4 m, measured in steps of 0.1 m.
-const NEAREST_M_MIN: f64 = 0.05;
+/// Least distance that a drive must keep from all things, in metres. Ours: the planner keeps 0.7 and 0.9 m in its two
+/// drives, the follower 0.7 and 0.5 m, measured in steps of 0.1 m.
+const NEAREST_M_MIN: f64 = 0.35;
 /// Most datagrams in flight: as many as the smallest kernel buffer holds.
 const UNDER_WAY: u64 = 60;
 /// Period of the ego poses and of the checks against the world, in ns.
@@ -46,6 +46,8 @@ const POSE_PERIOD_NS: i64 = 20_000_000;
 /// A program that drives by the maps of one layer.
 trait Driver: Default {
     const LAYER: &'static str;
+    /// True if the server remembers ground ([`clearway_mapping::memory`]).
+    const MEMORY: bool;
     fn update(&mut self, map: &MapView);
     /// The next move towards a goal.
     fn next_move(&self, goal: [f64; 2]) -> Move;
@@ -60,6 +62,7 @@ struct Move {
 
 impl Driver for Planner {
     const LAYER: &'static str = "speed";
+    const MEMORY: bool = false;
 
     fn update(&mut self, map: &MapView) {
         Planner::update(self, map).unwrap();
@@ -73,6 +76,8 @@ impl Driver for Planner {
 
 impl Driver for Follower {
     const LAYER: &'static str = "safe_path";
+    // The sensor does not see the ground beside a parked car that the vehicle passes.
+    const MEMORY: bool = true;
 
     fn update(&mut self, map: &MapView) {
         Follower::update(self, map).unwrap();
@@ -121,10 +126,11 @@ struct Driven {
     nearest_m: f64,
 }
 
-async fn server() -> Running {
+async fn server(memory: bool) -> Running {
     let mut config = config();
     config.zenoh.enabled = true;
     let vehicle = &mut config.vehicles[0];
+    vehicle.maps.memory.enabled = memory;
     // The stamps are older than the arrivals, and the simulated world does not contain the vehicle itself.
     vehicle.sensors[0].gps_late_days_max = 36_525.0;
     vehicle.sensors[0].range_m_min = 0.5;
@@ -137,7 +143,11 @@ impl Loop {
         let scene = town();
         let (x, y, heading) = scene.drive.course.at(scene.drive.start + plan.start_m, scene.drive.left);
         let here = Course::from(x, y, heading).straight(1.0);
-        let scene = Scene { drive: Drive::steady(here.into(), 0.0, 0.0, 0.0), ..scene };
+        let mut world = (*scene.world).clone();
+        // The car that drives in the same direction stays ahead: it would not brake for the vehicle.
+        let drives = world.objects.iter_mut().filter_map(|object| object.drive.as_mut());
+        drives.filter(|drive| drive.speed > 0.0).for_each(|drive| drive.start += plan.start_m);
+        let scene = Scene { drive: Drive::steady(here.into(), 0.0, 0.0, 0.0), world: world.into(), ..scene };
         let vehicle = SimulatedVehicle::new(scene, ScannerConfig { seed: plan.seed, ..ScannerConfig::default() });
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         Self { vehicle, socket, running, ingester, maps, plan, sent: 0 }
@@ -272,7 +282,7 @@ async fn map_since(maps: &mut MapStream, begin_ns: i64) -> MapView {
 
 /// Drives by the maps of gRPC, and also of zenoh if that is demanded.
 async fn drive<D: Driver>(plan: Plan, over_zenoh: bool) -> Driven {
-    let running = server().await;
+    let running = server(D::MEMORY).await;
     let client = Client::connect(&running.grpc.unwrap().to_string()).await.unwrap();
     let ingester = within("a stream", client.ingest("car")).await.unwrap();
     let selection = Subscription { layers: vec![D::LAYER.into()], ..Default::default() };

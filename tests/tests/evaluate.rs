@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use clearway::cli::checks::evaluate::{Options, evaluate};
 use clearway_tests::{binaries, run};
 use serde_json::Value;
 
@@ -106,9 +107,9 @@ fn every_variation_of_the_labelled_frame_is_judged() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn a_log_of_argoverse_is_judged_by_its_map_of_the_ground() {
-    let log = Path::new(env!("CLEARWAY_DRIVES")).join("argoverse2/adcf7d18-0510-35b0-a2fa-b4cea13a6d76");
-    let report = evaluated(&[&log.display().to_string()]);
+fn a_folder_of_logs_of_argoverse_is_judged_by_their_maps_of_the_ground() {
+    let logs = Path::new(env!("CLEARWAY_DRIVES")).join("argoverse2");
+    let report = evaluated(&[&logs.display().to_string()]);
     let row = &report["sources"][0]["rows"][0];
     assert_eq!(row["frames"], 1);
     let maps = row["maps"].as_array().expect("maps");
@@ -143,4 +144,20 @@ fn patchwork_is_judged_on_the_same_points_as_the_maps() {
         println!("{protocol}: Patchwork++ {peer:.4}, Clearway {own:.4}");
         assert!(peer > 0.95 && own >= peer, "{protocol}: {peer} {own}");
     }
+}
+
+#[test]
+fn a_variant_of_the_papers_is_selected_without_a_configuration() {
+    let report = |set: &[&str]| {
+        let set = set.iter().map(|text| (*text).to_owned()).collect();
+        evaluate(&Options { paths: vec!["sim:flat".into()], set, ..Options::default() }, |_, _| {})
+    };
+    let cells = |set: &[&str]| {
+        let report = report(set).expect("a report").to_json();
+        let maps = report["sources"][0]["maps"].as_array().expect("maps").clone();
+        maps.into_iter().find(|map| map["layer"] == "terrain").expect("terrain")["cells"].clone()
+    };
+    assert_ne!(cells(&[]), cells(&["vehicle.maps.terrain.variant=paper"]));
+    let error = report(&["vehicle.maps.terrain.variant=none"]).unwrap_err().to_string();
+    assert!(error.contains("vehicle.maps.terrain.variant"), "{error}");
 }

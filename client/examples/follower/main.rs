@@ -22,7 +22,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             continue;
         }
         follower.update(&map)?;
-        let Move { curvature_per_m, mps, path_m } = follower.next_move(follower.ahead(12.0));
+        let Move { curvature_per_m, mps, path_m } = follower.next_move(follower.ahead(10.0));
         let points = map.layer("safe_path")?.points.len();
         println!(
             "map {}: {points} safe points, path of {path_m:4.1} m; drive {mps:.1} m/s, curvature {curvature_per_m:+.3} 1/m",

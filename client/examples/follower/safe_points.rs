@@ -1,20 +1,31 @@
 //! Maps with the layer `safe_path` -> the next move: the vehicle follows the safe points (UT Austin thesis, section
 //! VI).
 //!
-//! In: maps, a goal. Out: the next [`Move`]. It uses each map alone, and of the map nothing but the safe points: their
-//! radii and links. As in the thesis, the vehicle stays within the radius of a safe point, drives to the next safe
-//! point, and chooses at a branch by the length that is left to the goal.
+//! In: maps, a goal. Out: the next [`Move`]. It uses the newest map alone, and of the map nothing but the safe points:
+//! their radii and links. As in the thesis, the vehicle stays within the radius of a safe point, drives to the next
+//! safe point, and chooses at a branch by the length that is left to the goal. Three rules are ours:
+//!
+//! - It aims at the place nearest to the goal, which lies in its own lane, and not at the middle of the street.
+//! - It leaves its lane to the left only if it sees free ground far ahead; else it waits. A car that comes towards it
+//!   is nearer in the next map, but the radii of one map do not show that it moves.
+//! - It is never faster than it can stop on the arc that is known to be free.
+//!
+//! The server should remember ground (`[vehicle.maps.memory] enabled = true`): a sensor on the roof does not see the
+//! ground beside a parked car that the vehicle passes, and without it the vehicle has no room there.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use clearway_client::{ClientError, MapView};
 
-use super::motion::{BRAKE_MPS2, CURVATURE_MAX, DISCS_M, MPS_MAX, Move, Point, distance, ego_pose, in_ego};
+use super::motion::{BRAKE_MPS2, CURVATURE_MAX, MPS_MAX, Move, Point, distance, ego_pose, in_ego};
 
+/// Centres of five discs that cover the vehicle, in metres ahead of its centre; each has a radius of 1 m, so that the
+/// vehicle passes where `safe_path` says that it fits.
+const DISCS_M: [f64; 5] = [-1.76, -0.88, 0.0, 0.88, 1.76];
 /// Distance that the centre of each disc keeps from obstacles, in metres, and greatest speed in m/s. The first is the
-/// disc's radius and 0.24 m more; the last is for passages about as wide as the configured vehicle.
-const CLEARANCES_M: [(f64, f64); 3] = [(1.4, MPS_MAX), (1.2, 3.0), (LINK_CLEARANCE_M, 1.0)];
+/// disc's radius and 0.25 m more; the last is for passages about as wide as the configured vehicle.
+const CLEARANCES_M: [(f64, f64); 3] = [(1.25, MPS_MAX), (1.1, 4.0), (LINK_CLEARANCE_M, 1.0)];
 /// Half the length and half the width of the vehicle, in metres. The ground under it is free.
 const HALF_M: [f64; 2] = [2.2, 0.9];
 /// Least distance to obstacles along a link, in metres: half the vehicle's width in the configuration of the server.
@@ -25,7 +36,15 @@ const STEP_M: f64 = 0.25;
 /// show how the path goes on there, and a straight line is the least that it can be.
 const REST_WEIGHT: f64 = 3.0;
 /// Least and greatest distance of the point to aim at, in metres.
-const AIM_M: std::ops::Range<f64> = 2.0..10.0;
+const AIM_M: std::ops::Range<f64> = 2.0..12.0;
+/// Places to aim at within the radius of a safe point, as shares of the way from the point towards the goal.
+const SHARES: [f64; 3] = [1.0, 0.5, 0.0];
+/// Distance to the left of the line to the goal within which the vehicle counts as in its lane, in metres.
+const LEFT_M: f64 = 0.5;
+/// Length of free ground ahead that the vehicle has to see before it leaves its lane to the left, in metres.
+const SIGHT_M: f64 = 20.0;
+/// Time from a return to the brakes, in seconds: one revolution, and the move until the next map.
+const REACTION_S: f64 = 0.2;
 
 /// The safe points of the newest map.
 #[derive(Debug, Default)]
@@ -104,32 +123,51 @@ impl Follower {
             let Some([x, y]) = self.find_aim(&path, goal, clearance_m) else { continue };
             let curvature_per_m = curvature([x, y]);
             let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
-            let to_stop = (2.0 * BRAKE_MPS2 * f64::max(path_m - 2.0, 0.0)).sqrt();
-            return Move { curvature_per_m, mps: mps.min(in_bend).min(to_stop), path_m };
+            let mps = mps.min(in_bend).min(stoppable_mps(x.hypot(y)));
+            return Move { curvature_per_m, mps, path_m };
         }
         Move { curvature_per_m: 0.0, mps: 0.0, path_m }
     }
 
-    /// The point to aim at: of the farthest safe point of the path that the vehicle can drive to on an arc, the place
-    /// within its radius that is nearest to the goal; or that safe point itself.
+    /// The point to aim at: of the places within the radii of the path's safe points that the vehicle can drive to on
+    /// an arc, the one nearest to the goal.
     fn find_aim(&self, path: &[usize], goal: Point, clearance_m: f64) -> Option<Point> {
-        let aims = path.iter().rev().flat_map(|index| {
+        let places = path.iter().flat_map(|index| {
             let SafePoint { at, radius_m, .. } = self.points[*index];
-            let off_m = distance(at, goal);
-            let share = if off_m > 0.0 { ((radius_m - clearance_m).max(0.0) / off_m).min(1.0) } else { 0.0 };
-            [[0, 1].map(|axis| at[axis] + share * (goal[axis] - at[axis])), at]
+            let within_m = (radius_m - clearance_m).max(0.0).min(distance(at, goal));
+            SHARES.map(|share| towards(at, goal, share * within_m))
         });
-        aims.filter(|[x, y]| *x > 0.0 && AIM_M.contains(&x.hypot(*y))).find(|aim| self.is_safe(*aim, clearance_m))
+        let is_ahead = |aim: &Point| aim[0] > 0.0 && AIM_M.contains(&aim[0].hypot(aim[1]));
+        let mut aims: Vec<Point> = places.filter(is_ahead).collect();
+        aims.sort_by(|a, b| distance(*a, goal).total_cmp(&distance(*b, goal)));
+        aims.into_iter().find(|aim| self.keeps_right(*aim, goal) && self.is_safe(*aim, clearance_m))
+    }
+
+    /// True if the aim is in the vehicle's lane or to the right of it, or if the ground beyond the aim is free as far
+    /// as [`SIGHT_M`].
+    fn keeps_right(&self, aim: Point, goal: Point) -> bool {
+        let ahead = goal.map(|metres| metres / distance(goal, [0.0; 2]));
+        let left_m = ahead[0] * aim[1] - ahead[1] * aim[0];
+        let steps = (SIGHT_M / STEP_M) as u32;
+        left_m <= LEFT_M
+            || (1..=steps).map(|step| f64::from(step) * STEP_M).all(|metres| {
+                let place = [0, 1].map(|axis| aim[axis] + metres * ahead[axis]);
+                self.is_within(place, LINK_CLEARANCE_M)
+            })
+    }
+
+    /// True if a place keeps this distance from obstacles: if it is so far within the radius of a safe point.
+    fn is_within(&self, place: Point, clearance_m: f64) -> bool {
+        self.points.iter().any(|point| distance(point.at, place) + clearance_m <= point.radius_m)
     }
 
     /// True if the vehicle stays within the radii of safe points on the arc to a point ahead.
     fn is_safe(&self, aim: Point, clearance_m: f64) -> bool {
         let (bend, length_m) = (curvature(aim), aim[0].hypot(aim[1]));
         let steps = (length_m / STEP_M).ceil();
-        let is_within = |[x, y]: Point| {
+        let is_free = |[x, y]: Point| {
             let is_under_vehicle = x.abs() <= HALF_M[0] && y.abs() <= HALF_M[1];
-            is_under_vehicle
-                || self.points.iter().any(|point| distance(point.at, [x, y]) + clearance_m <= point.radius_m)
+            is_under_vehicle || self.is_within([x, y], clearance_m)
         };
         let place = |step: f64, disc_m: f64| {
             let (chord_m, angle) = (length_m * step / steps, bend * length_m * step / steps);
@@ -138,9 +176,7 @@ impl Follower {
             [chord_m * half_cos + disc_m * cos, chord_m * half_sin + disc_m * sin]
         };
         bend.abs() <= CURVATURE_MAX
-            && (1..=steps as u32)
-                .map(f64::from)
-                .all(|step| DISCS_M.iter().all(|disc_m| is_within(place(step, *disc_m))))
+            && (1..=steps as u32).map(f64::from).all(|step| DISCS_M.iter().all(|disc_m| is_free(place(step, *disc_m))))
     }
 
     /// Indices of the points of the path from the vehicle to the point with the least length to the goal: along the
@@ -178,6 +214,18 @@ impl Follower {
     fn in_ego(&self, point: Point) -> Point {
         in_ego(self.ego, point)
     }
+}
+
+/// Greatest speed in m/s from which the vehicle stops within a length, after the reaction time.
+fn stoppable_mps(length_m: f64) -> f64 {
+    let reaction_mps = BRAKE_MPS2 * REACTION_S;
+    (reaction_mps * reaction_mps + 2.0 * BRAKE_MPS2 * length_m).sqrt() - reaction_mps
+}
+
+/// The point `metres` from one point towards another.
+fn towards(from: Point, to: Point, metres: f64) -> Point {
+    let share = metres / distance(from, to).max(f64::MIN_POSITIVE);
+    [0, 1].map(|axis| from[axis] + share * (to[axis] - from[axis]))
 }
 
 /// Curvature in 1/m of the arc that starts straight ahead and leads through a point.

@@ -10,7 +10,10 @@ use std::collections::{BinaryHeap, HashMap};
 use clearway_client::v1::ClassMeaning;
 use clearway_client::{ClientError, MapView};
 
-use super::motion::{BRAKE_MPS2, CURVATURE_MAX, DISCS_M, MPS_MAX, Move, Point, distance, ego_pose, in_ego};
+use super::motion::{BRAKE_MPS2, CURVATURE_MAX, MPS_MAX, Move, Point, distance, ego_pose, in_ego};
+
+/// Centres of three discs that cover a car, in metres ahead of its centre; each has a radius of 1.16 m.
+const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
 
 /// Edge of a cell of the planner's grid, in metres.
 const CELL_M: f64 = 0.5;

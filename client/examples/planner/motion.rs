@@ -2,8 +2,6 @@
 
 use clearway_client::MapView;
 
-/// Centres of three discs that cover a car, in metres ahead of its centre; each has a radius of 1.16 m.
-pub const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
 /// Greatest speed in m/s.
 pub const MPS_MAX: f64 = 8.0;
 /// Greatest braking and lateral acceleration in m/s².

@@ -43,10 +43,10 @@ impl Hull {
             let off = |axis: usize| (corners[0][axis].abs() - half[axis]).max(0.0);
             return off(0).hypot(off(1)) <= radius;
         }
-        // Convex shapes are apart where the normal of a side of either parts them.
+        // Convex shapes are apart where the normal of a side of either parts them. Two sides of the shape meet at `a`.
         let [a, b, c, _] = corners;
         let normal = |from: [f64; 2], to: [f64; 2]| [from[1] - to[1], to[0] - from[0]];
-        [[1.0, 0.0], [0.0, 1.0], normal(a, b), normal(b, c)].iter().all(|axis| {
+        [[1.0, 0.0], [0.0, 1.0], normal(a, b), normal(a, c)].iter().all(|axis| {
             let along = corners.map(|corner| axis[0] * corner[0] + axis[1] * corner[1]);
             let own = axis[0].abs() * half[0] + axis[1].abs() * half[1];
             let least = along.iter().copied().fold(f64::INFINITY, f64::min);
@@ -93,5 +93,12 @@ mod tests {
         assert_eq!([touched(0.0, 3.99, 0.0), touched(0.0, 4.01, 0.0)], [None, Some(Kind::Pole)]);
         assert_eq!([touched(-7.79, 0.0, 0.0), touched(-7.81, 0.0, 0.0)], [None, Some(Kind::Fence)]);
         assert_eq!(touched(20.0, 0.0, 0.0), None);
+    }
+
+    #[test]
+    fn a_car_that_stands_askew_is_touched_at_its_long_side_too() {
+        let world = World::on(Ground::default()).parked_car(3.0, 0.0, -0.5);
+        let touched = |y| world.touched(&Hull { x: 0.0, y, heading: 0.0, size: [4.4, 1.8, 1.6] }, 0.0);
+        assert_eq!([touched(-1.50), touched(-1.48)], [None, Some(Kind::ParkedCar)]);
     }
 }

@@ -54,6 +54,7 @@ const SEEDS: u64 = 156;
 #[command(after_help = "Examples:
   clearway evaluate sequences/00
   clearway evaluate sequences/00 --variations all
+  clearway evaluate sequences/00 --set vehicle.maps.terrain.variant=paper
   clearway evaluate scans --labels truth --extrinsics 0,0,1.9,0,0,0 --model hdl32e --config car.toml
   clearway evaluate sim:town --json
   clearway evaluate sim:random --seeds 100 --model vlp16
@@ -61,8 +62,8 @@ const SEEDS: u64 = 156;
 Even seeds, and the variations without an asterisk, are for tuning. Odd seeds, and the variations with an asterisk, are
 for final tables only: no parameter may be chosen by their figures.")]
 pub struct Options {
-    /// Folders with scans (.bin, .pcd) and labels (.label) of the same names, folders of Argoverse 2 logs, sim:flat,
-    /// sim:slopes, sim:canopy, sim:overhang, sim:town, sim:street, sim:track, or sim:random.
+    /// Folders with scans (.bin, .pcd) and labels (.label) of the same names, logs of Argoverse 2 and folders of logs,
+    /// sim:flat, sim:slopes, sim:canopy, sim:overhang, sim:town, sim:street, sim:track, or sim:random.
     #[arg(required = true, value_name = "PATH")]
     pub paths: Vec<String>,
     /// Labels of the scans, a folder or a file; inside the paths themselves if absent.
@@ -114,8 +115,8 @@ pub struct Options {
     /// Judge the maps of the first vehicle of this configuration; of the default configuration if absent.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Override a key of the configuration; may be given several times.
-    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
+    /// Override a key of the configuration, such as vehicle.maps.terrain.variant=paper; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 }
 
@@ -197,12 +198,13 @@ pub fn columns(degrees: u16) -> Option<u16> {
 /// [`EvaluateError`] for the first path that cannot be judged.
 pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64) + Send) -> Result<Report, EvaluateError> {
     let (maps, plan) = (maps(options)?, options.plan());
+    let paths: Vec<String> = options.paths.iter().flat_map(|path| logs_of(path)).collect();
     // Every path is checked before the first is judged, so that an error appears at once.
-    let sources = options.paths.iter().map(|path| Input::new(path, options)).collect::<Result<Vec<_>, _>>()?;
+    let sources = paths.iter().map(|path| Input::new(path, options)).collect::<Result<Vec<_>, _>>()?;
     let total = sources.iter().map(|input| input.frames(&plan)).sum();
     let (mut done, mut report) = (0, Report::default());
-    for (path, input) in options.paths.iter().zip(sources) {
-        let mut source = Source { path: path.clone(), ..Source::default() };
+    for (path, input) in paths.into_iter().zip(sources) {
+        let mut source = Source { path, ..Source::default() };
         let mut judged = || {
             done += 1;
             progress(done, total);
@@ -225,6 +227,12 @@ pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64) + Send) ->
         report.sources.push(source);
     }
     Ok(report)
+}
+
+/// The logs of Argoverse 2 in a folder of logs; else the path itself.
+fn logs_of(path: &str) -> Vec<String> {
+    let logs = Log::folders_in(Path::new(path));
+    if logs.is_empty() { vec![path.into()] } else { logs.iter().map(|log| log.display().to_string()).collect() }
 }
 
 /// What one path stands for.
@@ -286,7 +294,10 @@ impl Input {
 fn maps(options: &Options) -> Result<MapsConfig, EvaluateError> {
     let config = match &options.config {
         Some(file) => Config::load(file, &options.set)?,
-        None => Config::of_one_vehicle("car", "top"),
+        None => {
+            let text = Config::of_one_vehicle("car", "top").to_toml();
+            Config::parse(&text, Path::new("the default configuration"), &options.set)?
+        }
     };
     let mut maps = config.vehicles.into_iter().next().map(|vehicle| vehicle.maps).unwrap_or_default();
     if let Some(columns) = options.columns_deg.and_then(columns) {

@@ -38,6 +38,8 @@ const GROUND_OFF_M: f32 = 0.15;
 const AXLE_M: f64 = 0.33;
 /// Middle of the two sensors in Argoverse's frame, in metres, from the published calibration of its cars.
 const SENSOR_M: [f64; 3] = [1.35, 0.0, 1.60];
+/// File of a log that has the poses of the vehicle.
+const POSES: &str = "city_SE3_egovehicle.feather";
 /// Name of the only row.
 const RECORDED: &str = "as recorded";
 /// Number of lasers of both sensors.
@@ -51,9 +53,18 @@ pub struct Log {
 }
 
 impl Log {
+    /// The folders of the logs directly in a folder, by name.
+    pub fn folders_in(folder: &Path) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(folder).into_iter().flatten();
+        let mut folders: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
+        folders.retain(|folder| folder.join(POSES).is_file());
+        folders.sort();
+        folders
+    }
+
     /// The log in a folder; `None` if the folder is not one.
     pub fn find(folder: &Path) -> Option<Self> {
-        folder.join("city_SE3_egovehicle.feather").is_file().then_some(())?;
+        folder.join(POSES).is_file().then_some(())?;
         let entries = std::fs::read_dir(folder.join("sensors/lidar")).ok()?;
         let mut sweeps: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
         sweeps.retain(|path| path.extension().is_some_and(|extension| extension == "feather"));
@@ -82,7 +93,7 @@ impl Log {
         let extrinsics = Extrinsics { x_m, y_m, z_m: z_m + AXLE_M, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
         source.mounts.push(format!("{x_m},{y_m},{:.2},0,0,0: both sensors of Argoverse 2", extrinsics.z_m));
         let (mut pipeline, _) = pipeline(maps, &SensorSetup::default(), extrinsics)?;
-        let poses = Poses::read(&self.folder.join("city_SE3_egovehicle.feather"))?;
+        let poses = Poses::read(&self.folder.join(POSES))?;
         let map = GroundMap::read(&self.folder.join("map"))?;
         for (sequence, file) in (0..).step_by(2).zip(&self.sweeps) {
             let scan = read_sweep(file)?;
