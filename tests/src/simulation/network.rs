@@ -1,7 +1,7 @@
 //! The networks between the car's sensors and the server: what the sensors send, with their faults, until it arrives.
 
 use bytes::Bytes;
-use clearway::ingest::receipt::ScanTime;
+use clearway::ingest::receipt::EngineTime;
 use clearway::ingest::udp::DATAGRAM_BYTES_MAX;
 use clearway_mapping::event::{Body, Cause};
 use clearway_sim::vehicle::Datagram;
@@ -148,7 +148,7 @@ impl TestBed<'_> {
             self.offered += 1;
             let bytes = observation.encoded_len();
             // An unknown sensor ends a real stream; its car connects again.
-            let time = ScanTime::default();
+            let time = EngineTime::default();
             let _ = self.gateway.push(observation, bytes, time, &mut self.session, &self.outcome_sender);
         }
     }
