@@ -253,7 +253,7 @@ fn paths_start_at_the_vehicle_and_stay_on_drivable_ground() {
             _ if closed => &[OBSTACLE],
             DRIVABLE if reached => &[FREE, PATH],
             DRIVABLE | NOT_DRIVABLE => &[NOT_REACHED],
-            _ if shared.context().reach.unwrap().is_open_ground(ReachCell::at(x, y)) => &[FREE, PATH],
+            _ if shared.context().reach.unwrap().is_open_ground(ReachCell::at(x, y)) => &[FREE],
             _ => &[UNKNOWN],
         };
         assert!(expected.contains(class), "({x}, {y}): {class}");

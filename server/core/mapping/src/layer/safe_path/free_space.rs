@@ -2,9 +2,10 @@
 //!
 //! In: the layers `drivability`, radial, and `occupancy`, the sweep, and what the vehicle can reach. Out: a [`State`]
 //! for each cell: the state of the radial cell in which the cell's centre lies, unless an obstacle stands in the cell
-//! or the vehicle cannot reach it. Rows of the radial grid are metres long far away: where the radial cell is unknown or
-//! an obstacle, a cell that the vehicle reaches is drivable if its own ground was seen apart from what is closed. A
-//! radial cell with returns only from the vehicle's own outline (its bonnet) is unknown. Unseen ground is not free, with two exceptions:
+//! or the vehicle cannot reach it. Rows of the radial grid are metres long far away: where the radial cell is unknown
+//! or an obstacle, a cell that the vehicle reaches is free if its own ground was seen apart from what is closed; safe
+//! points keep away from it. A radial cell with returns only from the vehicle's own outline (its bonnet) is unknown.
+//! Unseen ground is not free, with two exceptions:
 //! - The blind zone: if the innermost seen cell of a column is drivable and begins within the zone, the ground nearer
 //!   to the vehicle, which no laser reaches, is assumed to be free too, as the UT Austin thesis assumes when segments
 //!   grow from the vehicle (section IV.3).
@@ -36,6 +37,9 @@ pub enum State {
     Obstacle,
     /// Free ground that the vehicle does not reach.
     NotReached,
+    /// Ground that was seen and is reached, in a radial cell that is unknown or an obstacle. Safe points keep away from
+    /// it, as from unseen ground.
+    Apart,
     /// Not seen, in the blind zone before drivable ground.
     Blind,
     /// Not seen, between drivable or blind cells of one ring or one azimuth.
@@ -151,7 +155,7 @@ impl FreeSpace {
         for (state, &cell) in self.states.iter_mut().zip(&self.reach_cell) {
             *state = match *state {
                 _ if reach.is_closed(cell) => State::Obstacle,
-                State::Obstacle | State::Unknown if reach.is_open_ground(cell) => State::Drivable,
+                State::Obstacle | State::Unknown if reach.is_open_ground(cell) => State::Apart,
                 // The obstacle stands in another part of the radial cell.
                 State::Obstacle => State::Unknown,
                 free if free.is_free() && !reach.is_reached(cell) => State::NotReached,
@@ -287,7 +291,7 @@ fn mark_along(
                 }
                 last_free = Some(i);
             }
-            State::Obstacle | State::NotReached => last_free = None,
+            State::Obstacle | State::NotReached | State::Apart => last_free = None,
         }
     }
 }
@@ -346,7 +350,7 @@ mod tests {
         let state = |x: f32, y: f32| space.states[(y * 4.0 + 80.0) as usize * 160 + (x * 4.0 + 80.0) as usize];
         assert_eq!(state(10.1, 5.1), State::Obstacle, "the pole");
         assert_eq!([state(10.6, 5.1), state(9.6, 4.6)], [State::Unknown; 2], "beside the pole");
-        assert_eq!([state(10.9, 5.1), state(9.1, 4.4)], [State::Drivable; 2], "three cells from the pole");
+        assert_eq!([state(10.9, 5.1), state(9.1, 4.4)], [State::Apart; 2], "three cells from the pole");
         assert_eq!(state(6.1, 5.1), State::Unknown, "no return");
     }
 }
