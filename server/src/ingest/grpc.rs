@@ -53,29 +53,29 @@ impl IngestService for Ingest {
         &self,
         request: Request<Streaming<v1::Observation>>,
     ) -> Result<Response<Self::StreamStream>, Status> {
-        let full = |of: &str, gateway: Option<&Arc<Gateway>>, error| {
-            gateway.inspect(|gateway| gateway.record_refusal("streams"));
+        let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
+        let connection = request.extensions().get::<Arc<Place>>().cloned();
+        let sender = connection.as_ref().map_or(Ipv4Addr::UNSPECIFIED.into(), |place| place.host());
+        let full = |of: &str, error| {
+            connection.as_ref().inspect(|place| place.count("streams"));
             Status::resource_exhausted(format!("{of}: {error}; close one first"))
         };
-        let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
-        let sender =
-            request.extensions().get::<Arc<Place>>().map_or(Ipv4Addr::UNSPECIFIED.into(), |place| place.host());
-        // What no vehicle is named for yet, the first one counts, so that one ledger has it.
-        let counts = self.gateways.all().first();
         let unnamed = self.gateways.take_unnamed_stream(sender);
-        let unnamed = unnamed.map_err(|error| full("streams that have not named their vehicle", counts, error))?;
+        let unnamed = unnamed.map_err(|error| full("streams that have not named their vehicle", error))?;
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
             .await
             .map_err(|_| Status::deadline_exceeded(format!("no observation within {OPENING_TIMEOUT:?}")))?;
+        // The vehicle of an unreadable observation is unknown: the first vehicle counts it, so that one ledger has it.
         let first = first.inspect_err(|status| {
-            counts.filter(|_| is_refusal(status)).inspect(|gateway| gateway.record_refusal("message"));
+            let gateway = self.gateways.all().first().filter(|_| is_refusal(status));
+            gateway.inspect(|gateway| gateway.record_refusal("message"));
         })?;
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let gateway = self.gateways.find(&first.vehicle)?.clone();
         caller.check_vehicle(&gateway.vehicle)?;
         let place = gateway.take_stream(sender);
-        let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), Some(&gateway), error))?;
+        let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
         drop(unnamed);
         let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), place);
         if first.body.is_none() {

@@ -22,7 +22,7 @@ pub const PACKET_REASONS: [&str; 18] = [
     "telemetry",
 ];
 /// Reasons for which messages are no observations.
-pub const OBSERVATION_REASONS: [&str; 15] = [
+pub const OBSERVATION_REASONS: [&str; 14] = [
     "body",
     "columns",
     "message",
@@ -37,10 +37,9 @@ pub const OBSERVATION_REASONS: [&str; 15] = [
     "ros_message",
     "scan_time",
     "stamp_ahead",
-    "streams",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.
-pub const CLOSE_REASONS: [&str; 12] = [
+pub const CLOSE_REASONS: [&str; 13] = [
     "accept_error",
     "calls",
     "denied",
@@ -53,4 +52,5 @@ pub const CLOSE_REASONS: [&str; 12] = [
     "over_limit",
     "over_limit_timeout",
     "stalled",
+    "streams",
 ];

@@ -176,8 +176,6 @@ async fn a_scan_whose_map_would_be_late_is_refused_and_one_sender_never_has_all_
     });
     let (held, error) = refused.await;
     assert!(held.len() == 2 && error.contains("vehicle car: 127.0.0.1 has 2 of 3 streams"), "{} {error}", held.len());
-    let refused = running.vehicles.0[0].status.snapshot().ledger.refused;
-    assert!(refused.get("observation").is_some_and(|count| *count > 1), "the refused stream is counted: {refused:?}");
     drop(held);
     within("shutdown", running.shutdown()).await.unwrap();
 }
