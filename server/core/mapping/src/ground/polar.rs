@@ -46,8 +46,8 @@ pub struct Return {
     pub z_m: f32,
 }
 
-/// The returns that are kept of a cell: height in millimetres in the upper 16 bits, then the place within the cell along
-/// the range and along the azimuth, 8 bits each.
+/// The returns that are kept of a cell: height in millimetres in the upper 16 bits, then the place within the cell
+/// along the range and along the azimuth, 8 bits each.
 #[derive(Clone, Copy)]
 struct Cell {
     /// Ascending.
