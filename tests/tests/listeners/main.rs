@@ -11,8 +11,9 @@ use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
 use std::process::{Command, Stdio};
 
-use clearway::config::{Config, Foxglove, Metrics};
+use clearway::config::{Config, Foxglove, Metrics, Vehicle};
 use clearway::server::Running;
+use clearway_client::Client;
 use clearway_proto::v1;
 use clearway_tests::attack::http2::{answer_pings_only, never_read};
 use clearway_tests::attack::sockets::{OPENINGS, Opening, closed, hold};
@@ -121,6 +122,24 @@ async fn a_reader_that_takes_no_maps_is_cut_although_it_answers_pings() {
     let cut = metric(&running, "clearway_connections_closed_total{listener=\"grpc\",reason=\"stalled\"}").await;
     assert_eq!(cut, 3.0);
     drop((maps, healthy));
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn streams_of_one_vehicle_leave_another_its_places_and_a_refused_one_is_counted() {
+    let mut config = everything();
+    config.vehicles[0].ingest.streams_max = 1;
+    let van = Vehicle { name: "van".into(), ..config.vehicles[0].clone() };
+    config.vehicles.push(van);
+    let running = start(config).await;
+    let client = Client::connect(&running.grpc.unwrap().to_string()).await.unwrap();
+    let car = within("a stream", client.ingest("car")).await.unwrap();
+    let van = within("a stream", client.ingest("van")).await.unwrap();
+    let refused = within("an answer", client.ingest("car")).await.err().expect("car has one place").to_string();
+    assert!(refused.contains("vehicle car: all 1 streams are open"), "{refused}");
+    let counted = metric(&running, "clearway_connections_closed_total{listener=\"grpc\",reason=\"streams\"}").await;
+    assert_eq!(counted, 1.0);
+    drop((car, van));
     within("shutdown", running.shutdown()).await.unwrap();
 }
 

@@ -3,7 +3,8 @@
 //! In: the lowest returns of the cells, the near plane. Out: by cell the height of its ground, or none. Each column
 //! keeps the range, height and slope of its outermost ground. A cell's height is predicted from its own and the
 //! neighbouring columns; the lowest return near the prediction is its ground. A return too far above it is an object,
-//! one too far below it a mirror image, and the next lowest return is tried.
+//! unless the next returns of its column show that the ground rises; one too far below it is a mirror image, and the
+//! next lowest return is tried.
 
 use super::plane::NearPlane;
 use super::polar::{CELLS, COLUMNS, PolarCells, ROWS, Return, beside, column_directions, row_start_m};
