@@ -14,6 +14,7 @@ use clearway_mapping::layer::safe_path::free_space::State;
 use clearway_mapping::layer::safe_path::links::Links;
 use clearway_mapping::layer::safe_path::medial_axis::{MedialAxis, Point};
 use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
+use clearway_mapping::reach::ReachCell;
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 use proptest::prelude::*;
@@ -252,6 +253,7 @@ fn paths_start_at_the_vehicle_and_stay_on_drivable_ground() {
             _ if closed => &[OBSTACLE],
             DRIVABLE if reached => &[FREE, PATH],
             DRIVABLE | NOT_DRIVABLE => &[NOT_REACHED],
+            _ if shared.context().reach.unwrap().is_open_ground(ReachCell::at(x, y)) => &[FREE],
             _ => &[UNKNOWN],
         };
         assert!(expected.contains(class), "({x}, {y}): {class}");

@@ -2,8 +2,10 @@
 //!
 //! In: the layers `drivability`, radial, and `occupancy`, the sweep, and what the vehicle can reach. Out: a [`State`]
 //! for each cell: the state of the radial cell in which the cell's centre lies, unless an obstacle stands in the cell
-//! or the vehicle cannot reach it. A radial cell with returns only from the vehicle's own outline (its bonnet) is
-//! unknown. Unseen ground is not free, with two exceptions:
+//! or the vehicle cannot reach it. Rows of the radial grid are metres long far away: where the radial cell is unknown
+//! or an obstacle, a cell that the vehicle reaches is free if its own ground was seen apart from what is closed; safe
+//! points keep away from it. A radial cell with returns only from the vehicle's own outline (its bonnet) is unknown.
+//! Unseen ground is not free, with two exceptions:
 //! - The blind zone: if the innermost seen cell of a column is drivable and begins within the zone, the ground nearer
 //!   to the vehicle, which no laser reaches, is assumed to be free too, as the UT Austin thesis assumes when segments
 //!   grow from the vehicle (section IV.3).
@@ -35,6 +37,9 @@ pub enum State {
     Obstacle,
     /// Free ground that the vehicle does not reach.
     NotReached,
+    /// Ground that was seen and is reached, in a radial cell that is unknown or an obstacle. Safe points keep away from
+    /// it, as from unseen ground.
+    Apart,
     /// Not seen, in the blind zone before drivable ground.
     Blind,
     /// Not seen, between drivable or blind cells of one ring or one azimuth.
@@ -150,6 +155,7 @@ impl FreeSpace {
         for (state, &cell) in self.states.iter_mut().zip(&self.reach_cell) {
             *state = match *state {
                 _ if reach.is_closed(cell) => State::Obstacle,
+                State::Obstacle | State::Unknown if reach.is_open_ground(cell) => State::Apart,
                 // The obstacle stands in another part of the radial cell.
                 State::Obstacle => State::Unknown,
                 free if free.is_free() && !reach.is_reached(cell) => State::NotReached,
@@ -285,7 +291,7 @@ fn mark_along(
                 }
                 last_free = Some(i);
             }
-            State::Obstacle | State::NotReached => last_free = None,
+            State::Obstacle | State::NotReached | State::Apart => last_free = None,
         }
     }
 }
@@ -293,6 +299,9 @@ fn mark_along(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ground::Ground;
+    use crate::reach::Reach;
+    use crate::reach::config::ReachConfig;
 
     #[test]
     fn a_hole_is_closed_exactly_if_it_is_as_narrow_as_configured() {
@@ -315,5 +324,33 @@ mod tests {
                 assert_eq!(marked(hole, width_m * 0.99), 0, "{width_m} m");
             }
         }
+    }
+
+    #[test]
+    fn ground_with_a_return_is_free_though_an_obstacle_stands_elsewhere_in_its_radial_cell() {
+        let config = ReachConfig::default();
+        let (mut ground, mut reach) = (Ground::new(config.outline()), Reach::new(&config));
+        let mut sweep = Sweep { mount_height_m: 1.9, ..Sweep::default() };
+        // A return in the middle of each cell, but in a strip; a pole at (10, 5).
+        let middles = (0..160).map(|index| centre_m(index, 160, 0.25));
+        let is_unseen = |x: f32| (6.0..6.5).contains(&x);
+        for (x, y) in middles.clone().flat_map(|x| middles.clone().map(move |y| (x, y))).filter(|(x, _)| !is_unseen(*x))
+        {
+            for z in [0.0, 0.6, 1.2].into_iter().take(if (x - 10.1).abs() + (y - 5.1).abs() < 0.1 { 3 } else { 1 }) {
+                sweep.x.push(x);
+                sweep.y.push(y);
+                sweep.z.push(z);
+            }
+        }
+        ground.estimate(&sweep);
+        reach.update(&sweep, &ground);
+        let mut space = FreeSpace::new(160, 0.25);
+        space.states.fill(State::Obstacle);
+        space.add_obstacles(&Context { reach: Some(&reach), ..Context::default() });
+        let state = |x: f32, y: f32| space.states[(y * 4.0 + 80.0) as usize * 160 + (x * 4.0 + 80.0) as usize];
+        assert_eq!(state(10.1, 5.1), State::Obstacle, "the pole");
+        assert_eq!([state(10.6, 5.1), state(9.6, 4.6)], [State::Unknown; 2], "beside the pole");
+        assert_eq!([state(10.9, 5.1), state(9.1, 4.4)], [State::Apart; 2], "three cells from the pole");
+        assert_eq!(state(6.1, 5.1), State::Unknown, "no return");
     }
 }

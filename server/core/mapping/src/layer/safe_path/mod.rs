@@ -72,7 +72,7 @@ impl SafePath {
         class.extend(self.free_space.states().iter().map(|state| {
             let class = match state {
                 State::Unknown | State::Blind | State::Hole => SafePathClass::Unknown,
-                State::Drivable => SafePathClass::Free,
+                State::Drivable | State::Apart => SafePathClass::Free,
                 State::Obstacle => SafePathClass::Obstacle,
                 State::NotReached => SafePathClass::NotReached,
             };
