@@ -12,7 +12,8 @@
 //! | points -> cells beside a step of the ground | `steps` |
 //! | points -> cells in a trough of the ground | `troughs` |
 //! | cells beside a step or in a trough -> those between two of them | `joins` |
-//! | cells beside a step ahead and behind -> those between them, beside the vehicle; ground behind hidden kerbs | `blind_zone` |
+//! | cells beside a step ahead and behind -> those between them, beside the vehicle | `blind_zone` |
+//! | the nearest ground, high over the plane under the vehicle -> its cells, beside the vehicle | `blind_zone` |
 //! | cells beside a step near the vehicle -> those on straight continuations of their line | `edges` |
 //! | obstacles -> the ground that they hide | `shadow` |
 //! | open and closed cells -> reached cells | `flood` |
@@ -211,8 +212,8 @@ impl Reach {
         cell.index().is_some_and(|cell| self.closed.get(cell % SIDE, cell / SIDE))
     }
 
-    /// True if the vehicle can get to a cell whose ground was seen, and no cell within half a metre of it is closed: the
-    /// foot of a bank or of a bush looks like ground.
+    /// True if the vehicle can get to a cell whose ground was seen, and no cell within half a metre of it is closed:
+    /// the foot of a bank or of a bush looks like ground.
     pub fn is_open_ground(&self, cell: ReachCell) -> bool {
         let Some(cell) = cell.index().filter(|cell| self.steps.low_mm(*cell) != i16::MAX) else { return false };
         let (ix, iy) = (cell % SIDE, cell / SIDE);
