@@ -1,7 +1,7 @@
 //! The reasons that metrics show with 0 before they occur, so that the first occurrence is a rise.
 
 /// Reasons for which packets and scans are refused; each has a series before it occurs, so that a rate is known then.
-pub const PACKET_REASONS: [&str; 18] = [
+pub const PACKET_REASONS: [&str; 19] = [
     "azimuth",
     "block_flag",
     "calibration",
@@ -14,6 +14,7 @@ pub const PACKET_REASONS: [&str; 18] = [
     "no_returns",
     "observation",
     "scan_lengths",
+    "scan_model",
     "scan_offset",
     "sensor",
     "source",

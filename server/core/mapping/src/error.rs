@@ -56,6 +56,37 @@ pub enum EventError {
         /// Number of points of the scan.
         points: usize,
     },
+    /// A ring of a scan is one that the configured model does not have.
+    #[error(
+        "scan with ring {ring}: the configured model {model} has {lasers} lasers, so 0 to {} is allowed; set the \
+         sensor's `model` to the one that sends the scans, or remove it",
+        lasers - 1
+    )]
+    ScanRing {
+        /// Greatest ring of the scan.
+        ring: u16,
+        /// The configured model.
+        model: &'static str,
+        /// Number of lasers of the model.
+        lasers: usize,
+    },
+    /// Many points of a scan lie where no laser of the configured model points.
+    #[error(
+        "scan with {outside_percent} % of its points outside of the elevations {} to {} degrees of the configured \
+         model {model}: at most {allowed_percent} % is allowed; set the sensor's `model` to the one that sends the \
+         scans, or remove it",
+        elevation_deg.0, elevation_deg.1
+    )]
+    ScanElevation {
+        /// Share of the points outside, percent.
+        outside_percent: usize,
+        /// Greatest share that is allowed, percent.
+        allowed_percent: usize,
+        /// The configured model.
+        model: &'static str,
+        /// Lowest and highest nominal elevation of the model, degrees.
+        elevation_deg: (f32, f32),
+    },
     /// A point of a scan is later than the scan's stamp.
     #[error("scan with a point {offset_ns} ns after its stamp: at most 0 is allowed")]
     ScanOffset {
@@ -97,14 +128,15 @@ pub enum EventError {
 
 impl EventError {
     /// The key under which a ledger counts the error: the decoder's own key (`length`, `block_flag`, and so on), or
-    /// `source`, `sensor`, `scan_lengths`, `scan_offset`, `no_returns`, `stamp`, `stamp_range`, `pose`, or the key of a
-    /// road error ([`RoadError::reason`]).
+    /// `source`, `sensor`, `scan_lengths`, `scan_model`, `scan_offset`, `no_returns`, `stamp`, `stamp_range`, `pose`, or
+    /// the key of a road error ([`RoadError::reason`]).
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Datagram(refusal) => refusal.reason(),
             Self::Source { .. } => "source",
             Self::Sensor(_) | Self::Withdrawn { .. } => "sensor",
             Self::ScanLengths { .. } | Self::ScanList { .. } => "scan_lengths",
+            Self::ScanRing { .. } | Self::ScanElevation { .. } => "scan_model",
             Self::ScanOffset { .. } => "scan_offset",
             Self::NoReturn { .. } => "no_returns",
             Self::Stamp { .. } => "stamp",

@@ -100,11 +100,37 @@ fn sensor() -> SensorConfig {
 }
 
 #[test]
+fn a_scan_that_contradicts_the_configured_model_is_refused_by_name() {
+    let refused = |sensor: &SensorConfig, scan: Scan| {
+        let mut pipeline = Pipeline::new(&VehicleConfig::new("car", vec![sensor.clone()]), vec![None]).unwrap();
+        let event = Event { sequence: 0, arrival_ns: scan.stamp_ns, source: 0, body: Body::Scan(scan) };
+        pipeline.step(&event).map(|map| map.is_some()).map_err(|error| (error.reason(), error.to_string()))
+    };
+    let vlp16 = SensorConfig { model: Some(clearway_lidar::model::Model::Vlp16), ..sensor() };
+    let with_rings = |lift: u16| Scan { ring: (0..16 * 360u16).map(|i| 15 - i / 360 + lift).collect(), ..ground() };
+    // The upper rings alone lie within the elevations of a VLP-16.
+    let upper = |scan: Scan| {
+        let cut = |of: &Vec<f32>| of[..6 * 360].to_vec();
+        let ring = scan.ring.iter().copied().take(6 * 360).collect();
+        Scan { x: cut(&scan.x), y: cut(&scan.y), z: cut(&scan.z), intensity: cut(&scan.intensity), ring, ..scan }
+    };
+    let (reason, said) = refused(&vlp16, upper(with_rings(48))).unwrap_err();
+    assert_eq!(reason, "scan_model");
+    assert!(said.contains("scan with ring 63: the configured model vlp16 has 16 lasers, so 0 to 15 is"), "{said}");
+    let (reason, said) = refused(&vlp16, with_rings(0)).unwrap_err();
+    assert_eq!(reason, "scan_model");
+    assert!(said.contains("of its points outside of the elevations -15 to 15 degrees of the configured"), "{said}");
+    assert_eq!(refused(&vlp16, upper(with_rings(0))), Ok(true));
+    // The configured elevations are used in place of the model's.
+    assert_eq!(refused(&SensorConfig { elevations_deg: vec![-20.0, -5.0], ..vlp16 }, ground()), Ok(true));
+}
+
+#[test]
 fn a_map_names_the_source_of_the_elevations() {
     use ElevationSource::*;
     let elevations_deg = vec![-20.0, -10.0, -5.0];
     let ringed = Scan { ring: (0..16 * 360u16).map(|i| 15 - i / 360).collect(), ..ground() };
-    let with_model = SensorConfig { model: Some(clearway_lidar::model::Model::Vlp16), ..sensor() };
+    let with_model = SensorConfig { model: Some(clearway_lidar::model::Model::Hdl32e), ..sensor() };
     let both = SensorConfig { elevations_deg: elevations_deg.clone(), ..with_model.clone() };
     let table = Some(Calibration::factory(clearway_lidar::model::Model::Hdl32e));
     let cases = [
@@ -112,7 +138,7 @@ fn a_map_names_the_source_of_the_elevations() {
         ("order", sensor(), None, ground(), Estimated, 16),
         ("no order", sensor(), None, shuffled(&ground()), Unknown, 1),
         ("elevations", SensorConfig { elevations_deg, ..sensor() }, None, ground(), Configured, 3),
-        ("model", with_model.clone(), None, ground(), Model, 6),
+        ("model", with_model.clone(), None, ground(), Model, 22),
         ("both", both.clone(), None, ground(), Configured, 3),
         ("table", both, table, ground(), Table, 22),
     ];

@@ -11,11 +11,13 @@
 //! | [`distance_series`] | revolution -> how far each range deviates from its laser's neighbouring ranges |
 //! | [`ring_series`] | scan with rings -> the same for each of its points |
 //! | `no_returns` | revolution -> directions of the rays without a return |
+//! | `model_check` | scan, configured model -> error if the scan cannot be one of it |
 //! | `rings` | scan -> elevations of the lasers, rings of the points |
 //! | [`mount`] | revolutions -> height, pitch and roll of a sensor; scans -> the ground's deviation from its mount |
 
 pub mod deviation;
 pub mod distance_series;
+mod model_check;
 pub mod motion;
 pub mod mount;
 mod no_returns;

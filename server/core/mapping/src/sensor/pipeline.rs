@@ -20,6 +20,7 @@ use crate::event_time::EventTime;
 use crate::layer::ScanExtras;
 use crate::map::{Contribution, ElevationSource, SensorState};
 use crate::sensor::distance_series::DistanceSeries;
+use crate::sensor::model_check;
 use crate::sensor::motion::{EgoTrajectory, Motion};
 use crate::sensor::mount::check::{MountCheck, MountDeviation};
 use crate::sensor::no_returns::{find_no_returns, rotated};
@@ -233,8 +234,9 @@ impl SensorPipeline {
     ///
     /// # Errors
     /// [`EventError::ScanLengths`], [`EventError::ScanList`], [`EventError::ScanOffset`], [`EventError::NoReturn`] or
-    /// [`EventError::StampRange`] if a value of the scan is not allowed; [`EventError::Stamp`] if the scan is not
-    /// newer.
+    /// [`EventError::StampRange`] if a value of the scan is not allowed; [`EventError::ScanRing`] or
+    /// [`EventError::ScanElevation`] if it is no scan of the configured model, from which the elevations come;
+    /// [`EventError::Stamp`] if it is not newer.
     pub fn apply_scan(
         &mut self,
         scan: &Scan,
@@ -244,6 +246,9 @@ impl SensorPipeline {
         deadline_ns: i64,
     ) -> Result<RemovedPoints, EventError> {
         check_scan(scan)?;
+        if let (Some(model), ElevationSource::Model) = (self.model, self.scan_elevations) {
+            model_check::check(scan, model)?;
+        }
         if let Some((newest_ns, accepted_ns)) = self.newest_scan
             && (scan.stamp_ns == newest_ns || now.event_ns.saturating_sub(accepted_ns) <= deadline_ns)
         {
