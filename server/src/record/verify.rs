@@ -66,6 +66,8 @@ pub struct Report {
     /// What `clearway repair` could not read of the damaged file, if it wrote this one. The events and maps that are
     /// lost there are no differences.
     pub repaired: Vec<String>,
+    /// Version of clearway that recorded the file, as its metadata states it; empty without one.
+    pub made_by: String,
     /// The first differences.
     pub differences: Vec<Difference>,
     /// Number of all differences.
@@ -98,7 +100,7 @@ impl Report {
             "events": self.events, "maps": self.maps, "equal": self.equal, "different": self.different,
             "cells": self.cells, "recorded_maps": self.recorded.as_str(),
             "cut": self.cut, "beyond_cut": self.beyond_cut, "unjudged": self.unjudged, "incomplete": self.incomplete,
-            "dropped": self.dropped, "dropped_because": self.dropped_because,
+            "dropped": self.dropped, "dropped_because": self.dropped_because, "made_by": self.made_by,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(), "repaired": self.repaired,
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
         })
@@ -164,7 +166,8 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             extra: BTreeSet::new(),
         });
     }
-    let mut report = Report { recorded: recording.maps(), ..Report::default() };
+    let made_by = recording.header().value("version").to_owned();
+    let mut report = Report { recorded: recording.maps(), made_by, ..Report::default() };
     let mut losses = 0;
     while let Some(message) = recording.next() {
         let losses_before = std::mem::replace(&mut losses, recording.loss_count());

@@ -24,7 +24,10 @@ pub fn reason(outcome: &Outcome) -> String {
             let is_whole = report.incomplete.is_none() && report.repaired.is_empty() && report.dropped == 0;
             let events = if is_whole { "the events are whole" } else { "the events that are left are in order" };
             let result = match report.differences.first() {
-                Some(first) => format!("{}: {first}", counted(report.different, "difference")),
+                Some(first) => {
+                    let count = counted(report.different, "difference");
+                    format!("{count}: {first}; {}", versions(&report.made_by, env!("CARGO_PKG_VERSION")))
+                }
                 None if report.events == 0 => "no event, so nothing is verified".to_owned(),
                 None if report.recorded == RecordedMaps::None => format!("{events}; no map is recorded"),
                 None if report.equal == 0 && report.unjudged > 0 => "no map can be judged".to_owned(),
@@ -67,6 +70,18 @@ pub fn reason(outcome: &Outcome) -> String {
             result + after_loss + &incomplete.collect::<String>()
         }
         Outcome::Unreadable(reason) => format!("not checked: {reason}"),
+    }
+}
+
+/// Which version recorded the maps that differ, and which one has made them again.
+fn versions(made_by: &str, this: &str) -> String {
+    match made_by {
+        "" => format!("the file does not state which version recorded it, and this is clearway {this}"),
+        same if same == this => format!("clearway {this} recorded the file, as this is"),
+        other => format!(
+            "clearway {other} recorded the file, and this is clearway {this}, whose maps may differ: CHANGELOG.md \
+             names the changes, and `clearway replay FILE --record NEW` records the maps of this version"
+        ),
     }
 }
 
