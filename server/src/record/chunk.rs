@@ -66,19 +66,7 @@ pub(super) fn split_record<'a>(content: &mut &'a [u8]) -> Result<Record<'a>, Mca
 /// Parses a record, and refuses one whose length is not that of its fields, because its kind or its length is damaged.
 pub(super) fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
     let record = parse(opcode, body)?;
-    let texts = |texts: &BTreeMap<String, String>| {
-        size_of::<u32>()
-            + texts.iter().map(|(key, value)| 2 * size_of::<u32>() + key.len() + value.len()).sum::<usize>()
-    };
-    // A later version of the format may add fields at the end of these, which are short.
-    let fields = match &record {
-        Record::Header(of) => Some(8 + of.profile.len() + of.library.len()),
-        Record::Schema { header, data } => Some(14 + header.name.len() + header.encoding.len() + data.len()),
-        Record::Channel(of) => Some(12 + of.topic.len() + of.message_encoding.len() + texts(&of.metadata)),
-        Record::Metadata(of) => Some(4 + of.name.len() + texts(&of.metadata)),
-        Record::Attachment { header, data, .. } => Some(36 + header.name.len() + header.media_type.len() + data.len()),
-        _ => None,
-    };
+    let fields = fields_bytes(&record);
     if fields.is_some_and(|fields| body.len() > fields + ADDED_BYTES_MAX) {
         return Err(McapError::UnexpectedEof);
     }
@@ -91,6 +79,31 @@ pub(super) fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, Mcap
         _ => body.len(),
     };
     if length == body.len() { Ok(record) } else { Err(McapError::UnexpectedEof) }
+}
+
+/// True if a record of this kind is longer than its known fields: a later version of the format has added some, or its
+/// length is damaged.
+pub(super) fn has_added_bytes(opcode: u8, body: &[u8]) -> bool {
+    let is_extensible = matches!(opcode, op::HEADER | op::SCHEMA | op::CHANNEL | op::METADATA | op::ATTACHMENT);
+    let record = is_extensible.then(|| parse_strictly(opcode, body).ok()).flatten();
+    record.and_then(|record| fields_bytes(&record)).is_some_and(|fields| body.len() > fields)
+}
+
+/// Length of the known fields of a record to whose end a later version of the format may add fields, and which is
+/// short.
+fn fields_bytes(record: &Record<'_>) -> Option<usize> {
+    let texts = |texts: &BTreeMap<String, String>| {
+        size_of::<u32>()
+            + texts.iter().map(|(key, value)| 2 * size_of::<u32>() + key.len() + value.len()).sum::<usize>()
+    };
+    match record {
+        Record::Header(of) => Some(8 + of.profile.len() + of.library.len()),
+        Record::Schema { header, data } => Some(14 + header.name.len() + header.encoding.len() + data.len()),
+        Record::Channel(of) => Some(12 + of.topic.len() + of.message_encoding.len() + texts(&of.metadata)),
+        Record::Metadata(of) => Some(4 + of.name.len() + texts(&of.metadata)),
+        Record::Attachment { header, data, .. } => Some(36 + header.name.len() + header.media_type.len() + data.len()),
+        _ => None,
+    }
 }
 
 /// True if an entry of a chunk's index leads to a message of this channel with the entry's time.

@@ -10,8 +10,8 @@ use mcap::records::{MessageIndex, Record, op};
 use mcap::{MAGIC, McapError};
 
 use super::chunk::{
-    CHUNK_FIELDS_BYTES, RECORD_BYTES_MAX, RECORD_HEAD_BYTES, attachment_name, decompress, parse_strictly, split_record,
-    u32_at, u64_at,
+    CHUNK_FIELDS_BYTES, RECORD_BYTES_MAX, RECORD_HEAD_BYTES, attachment_name, decompress, has_added_bytes,
+    parse_strictly, split_record, u32_at, u64_at,
 };
 use super::chunk_indexes::ChunkIndexes;
 use super::damage::LostPart;
@@ -205,20 +205,21 @@ impl McapRecords {
         }
         let (opcode, length) = head(self.bytes());
         let Some(length) = length.filter(|_| is_opcode(opcode)) else {
-            self.search("a record has an unknown kind or an impossible length")?;
-            return Ok(None);
+            return self.search("a record has an unknown kind or an impossible length").map(|()| None);
         };
         let end = RECORD_HEAD_BYTES + length;
         if !self.fill(end)? {
             // Either a crash has cut the file here, or the length is damaged and other records follow.
-            self.search("a record reaches beyond the end of the file")?;
-            return Ok(None);
+            return self.search("a record reaches beyond the end of the file").map(|()| None);
         }
+        let is_longer = has_added_bytes(opcode, &self.bytes()[RECORD_HEAD_BYTES..end]);
+        let is_too_long = is_longer && !self.goes_on_at(opcode, end)?;
         let body = &self.bytes()[RECORD_HEAD_BYTES..end];
         let is_index = matches!(opcode, op::MESSAGE | PRIVATE..) && ChunkIndexes::is_index(body, &self.chunk.0);
         let record = parse_strictly(opcode, body);
         let from = self.offset;
         let read = match record {
+            _ if is_too_long => Err(("a record is longer than its fields, and no record follows it".to_owned(), None)),
             _ if is_index => Err(("it has the kind of other records".to_owned(), None)),
             Ok(Record::Chunk { header, data }) => match decompress(&header, &data) {
                 Ok(content) => {
@@ -247,10 +248,7 @@ impl McapRecords {
                 self.private = Some((from, self.offset)).filter(|_| opcode >= PRIVATE);
                 Ok(record)
             }
-            Err((reason, _)) if !self.goes_on_at(opcode, end)? => {
-                self.search(&reason)?;
-                Ok(None)
-            }
+            Err((reason, _)) if !self.goes_on_at(opcode, end)? => self.search(&reason).map(|()| None),
             Err((reason, chunk_ns)) => {
                 self.consume(end);
                 self.add_lost((from, self.offset), &reason);
