@@ -12,12 +12,12 @@ use crate::event::Scan;
 /// nominal ones by less, and a sender that compensates the motion of the vehicle turns points by less.
 const TOLERANCE_DEG: f32 = 2.0;
 
-/// Share of the points that may lie farther outside, percent. Ours: 17 % of the points of a KITTI scan of an HDL-64E lie
-/// outside of a VLP-16's elevations.
+/// Share of the points that may lie farther outside, percent. Ours: 17 % of the points of a KITTI scan of an HDL-64E
+/// lie outside of a VLP-16's elevations.
 const OUTSIDE_PERCENT_MAX: usize = 5;
 
-/// One of so many points is looked at. Ours: a scan of the wrong model has thousands outside, and no sensor has a number
-/// of lasers that divides by it, so that points of all lasers are looked at.
+/// One of so many points is looked at. Ours: a scan of the wrong model has thousands outside, and no sensor has a
+/// number of lasers that divides by it, so that points of all lasers are looked at.
 const STRIDE: usize = 17;
 
 /// Least number of points of a scan whose elevations are judged. Ours: a scan of few points shows an object, not the
