@@ -38,10 +38,10 @@ pub(super) fn check(scan: &Scan, model: Model) -> Result<(), EventError> {
         return Ok(());
     }
     let [low, high] =
-        [elevation_deg.0 - TOLERANCE_DEG, elevation_deg.1 + TOLERANCE_DEG].map(|of| of.to_radians().tan());
+        [elevation_deg.0 - TOLERANCE_DEG, elevation_deg.1 + TOLERANCE_DEG].map(|of| libm::tanf(of.to_radians()));
     let (mut points, mut outside) = (0, 0);
     for i in (0..scan.x.len()).step_by(STRIDE) {
-        let (range_m, z_m) = (scan.x[i].hypot(scan.y[i]), scan.z[i]);
+        let (range_m, z_m) = ((scan.x[i] * scan.x[i] + scan.y[i] * scan.y[i]).sqrt(), scan.z[i]);
         // Comparisons with NaN are false.
         points += usize::from(range_m > 0.0);
         outside += usize::from(z_m < low * range_m || z_m > high * range_m);
