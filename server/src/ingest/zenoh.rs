@@ -2,7 +2,7 @@
 //! reports go to `clearway/<vehicle>/ingest/report`.
 //!
 //! zenoh's callback only queues a sample: each source has a queue of its own, within bounds, and what is in it is
-//! decoded in its order, independently of the others ([`Source`](super::zenoh_source::Source)). A source is the zenoh
+//! decoded in its order, independently of the others ([`Source`]). A source is the zenoh
 //! session that a sample names (zenoh's `source_info`); samples without it share one queue. A sample that exceeds a
 //! bound is counted as `queue`, and its client learns of it because its numbers then have a gap. Reports are dropped
 //! under congestion, so that a stopped peer does not delay the others; the newest acknowledgement is therefore repeated
