@@ -103,7 +103,7 @@ pub(crate) async fn endpoints(session: &Session) -> Vec<String> {
 }
 
 /// The names in the certificates of the peers at the other end of this session's links.
-pub(crate) struct PeerNames {
+struct PeerNames {
     session: Session,
     names: BTreeMap<ZenohId, String>,
     read: Option<Instant>,
@@ -118,13 +118,13 @@ impl PeerNames {
     const READS_AT_ONCE: u32 = 100;
     const READS_PER_SECOND: u32 = 20;
 
-    pub(crate) fn new(session: &Session) -> Self {
+    fn new(session: &Session) -> Self {
         let reads = Budget::new(Self::READS_AT_ONCE, Self::READS_PER_SECOND);
         Self { session: session.clone(), names: BTreeMap::new(), read: None, reads }
     }
 
     /// The common name in the certificate of a peer; `None` if no link of this session leads to it, or without TLS.
-    pub(crate) async fn name(&mut self, peer: ZenohId) -> Option<&str> {
+    async fn name(&mut self, peer: ZenohId) -> Option<&str> {
         let is_old = self.read.is_none_or(|read| read.elapsed() > Self::AGE_MAX);
         if is_old || (!self.names.contains_key(&peer) && self.reads.take()) {
             let links = self.session.info().links().await;
@@ -132,6 +132,36 @@ impl PeerNames {
             self.read = Some(Instant::now());
         }
         self.names.get(&peer).map(String::as_str)
+    }
+}
+
+/// Who may send observations and queries, if clients have roles.
+pub struct Senders {
+    peers: PeerNames,
+    may_call: MayCall,
+}
+
+/// Whether a client with these names in its certificate may do what this RPC does, to this vehicle if one is named; if
+/// not, why.
+type MayCall = Box<dyn Fn(&str, Option<&str>, &[String]) -> Result<(), String> + Send + Sync>;
+
+impl Senders {
+    /// The senders of a session whose peers connect to this server: each shows its own certificate.
+    pub fn new(session: &Session, may_call: MayCall) -> Self {
+        Self { peers: PeerNames::new(session), may_call }
+    }
+
+    /// Checks by the certificate of its link that the sender of a sample or query may do what an RPC does, to a vehicle
+    /// if one is named.
+    ///
+    /// # Errors
+    /// Why it may not.
+    pub async fn check(&mut self, rpc: &str, vehicle: Option<&str>, source: Option<ZenohId>) -> Result<(), String> {
+        let Some(source) = source else {
+            return Err("the message does not state its source; with roles it must (zenoh's source_info)".into());
+        };
+        let name = self.peers.name(source).await.map(str::to_owned);
+        (self.may_call)(rpc, vehicle, name.as_slice())
     }
 }
 

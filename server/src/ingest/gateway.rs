@@ -9,11 +9,12 @@ use std::time::Duration;
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
 use clearway_proto::v1;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
+use super::engine_time::{EngineTime, EngineTimes};
 use super::observation::{self, Bodies, Limits, ObservationError};
 use super::queue::EventQueue;
-use super::receipt::{ClientSession, EngineTime, ObservationId, Outcome, OutcomeSender, Receipt};
+use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, Receipt};
 use super::stream_places::{StreamLimitError, StreamPlace, StreamPlaces};
 use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::base::sync::locked;
@@ -32,11 +33,11 @@ pub struct Gateway {
     pub in_flight_max: usize,
     sensors: Mutex<Sensors>,
     streams: StreamPlaces,
+    /// The engine's time for the observations.
+    pub time: EngineTimes,
     map_time: Arc<MapTime>,
     /// Longest time that a map of scans may take.
     map_time_max: Duration,
-    /// The time that the maps of waiting points take, in microseconds: at most `map_time_max`.
-    waiting_us: Arc<Semaphore>,
     queue: EventQueue,
 }
 
@@ -53,8 +54,6 @@ struct Sensors {
     newest_scans: BTreeMap<u16, (usize, i64)>,
 }
 
-/// Returns of a packet, at most: those of a Velodyne have 12 blocks of 32.
-const PACKET_RETURNS: usize = 384;
 /// A scan that is older has no part in the next map. Ours: two revolutions of the slowest sensor.
 const SCAN_AGE_NS_MAX: i64 = 400_000_000;
 
@@ -93,9 +92,9 @@ impl Gateway {
                 newest_scans: BTreeMap::new(),
             }),
             streams: StreamPlaces::new(streams_max, (streams_max / 4).max(1)),
+            time: EngineTimes::new(map_time.clone(), map_time_max),
             map_time,
             map_time_max,
-            waiting_us: Arc::new(Semaphore::new(micros(map_time_max) as usize)),
             queue: queue.clone(),
         }
     }
@@ -106,24 +105,6 @@ impl Gateway {
     /// [`StreamLimitError`] if there is none for this sender.
     pub fn take_stream(&self, sender: IpAddr) -> Result<StreamPlace, StreamLimitError> {
         self.streams.take(sender)
-    }
-
-    /// Waits until the points before this observation leave the engine time for it, so that no map is late because
-    /// points came faster than maps are made. Only a scan and packets wait.
-    pub async fn wait_for_time(&self, observation: &v1::Observation) -> EngineTime {
-        let takes = match &observation.body {
-            Some(v1::observation::Body::Scan(scan)) => {
-                let rays = scan.x.len() / size_of::<f32>() + scan.no_returns.len() / size_of::<[f32; 3]>();
-                self.map_time.of(rays)
-            }
-            Some(v1::observation::Body::Packets(packets)) => {
-                self.map_time.of_part(packets.lengths.len() / size_of::<u16>() * PACKET_RETURNS)
-            }
-            _ => return EngineTime::default(),
-        };
-        let took = takes.min(self.map_time_max);
-        // The semaphore is never closed.
-        EngineTime(self.waiting_us.clone().acquire_many_owned(micros(took)).await.ok())
     }
 
     /// Checks one observation of `bytes` bytes and pushes its events; the last one holds `time` until it is processed.
@@ -297,11 +278,6 @@ impl Gateway {
     }
 }
 
-/// Whole microseconds, at least one.
-fn micros(time: Duration) -> u32 {
-    u32::try_from(time.as_micros()).unwrap_or(u32::MAX).max(1)
-}
-
 /// True if an observation concerns no sensor but the whole vehicle.
 fn concerns_vehicle(observation: &v1::Observation) -> bool {
     use v1::observation::Body::{Declaration, EgoPose, Road};
@@ -370,6 +346,7 @@ mod tests {
     use super::*;
     use crate::base::clock::Clock;
     use crate::config::Config;
+    use crate::ingest::engine_time::Waiting;
     use crate::ingest::queue::{event_queue, event_queue_with_clock};
 
     fn scan(number: u64, points: usize) -> v1::Observation {
@@ -386,27 +363,17 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_waits_until_those_before_it_leave_the_engine_time() {
+    fn the_engine_time_of_a_scan_is_free_when_its_event_is_dropped() {
         let (queue, events) = event_queue(16);
         let gateway = Gateway::new(&vehicle(40), &queue, Arc::default());
         let (outcomes, _reports) = unbounded_channel();
         let mut session = ClientSession::new(0);
-        for number in 1..=2 {
-            let time = gateway.wait_for_time(&scan(number, 80_000)).now_or_never().expect("10 of 20 ms");
-            gateway.push(scan(number, 80_000), 0, time, &mut session, &outcomes).unwrap();
-        }
-        let third = scan(3, 80_000);
-        assert!(gateway.wait_for_time(&third).now_or_never().is_none(), "two scans of 10 ms wait for the engine");
-        // 38,400 returns, 3.8 ms.
-        let packets = v1::Packets { lengths: pack(&[1206_u16; 100]), ..Default::default() };
-        let packets = v1::observation::Body::Packets(packets);
-        let packets = v1::Observation { body: Some(packets), ..Default::default() };
-        assert!(gateway.wait_for_time(&packets).now_or_never().is_none());
-        let pose = v1::observation::Body::EgoPose(v1::EgoPose::default());
-        let pose = v1::Observation { body: Some(pose), ..Default::default() };
-        assert!(gateway.wait_for_time(&pose).now_or_never().is_some(), "a pose takes no time");
+        let share = gateway.time.share();
+        let time = |number| Waiting::time(&mut Some(gateway.time.wait(scan(number, 80_000), 0, &share))).now_or_never();
+        gateway.push(scan(1, 80_000), 0, time(1).expect("nothing waits"), &mut session, &outcomes).unwrap();
+        assert!(time(2).is_none(), "the first scan waits for the engine");
         drop(events.recv().unwrap());
-        assert!(gateway.wait_for_time(&third).now_or_never().is_some());
+        assert!(time(2).is_some());
     }
 
     #[test]

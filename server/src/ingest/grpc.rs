@@ -16,8 +16,9 @@ use prost::Message;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
+use super::engine_time::{EngineTime, TimeShare, Waiting};
 use super::gateway::{Gateway, Gateways};
-use super::receipt::{ClientSession, EngineTime, ObservationId, Outcome, OutcomeSender};
+use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 use super::stream_places::StreamPlace;
 use crate::publish::listen::Place;
 use crate::publish::listen::access::Caller;
@@ -77,11 +78,12 @@ impl IngestService for Ingest {
         let place = gateway.take_stream(sender);
         let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
         drop(unnamed);
-        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), place);
+        let share = gateway.time.share_of(sender);
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), share, place);
         if first.body.is_none() {
             stream.acknowledge_opening(&first);
         } else {
-            stream.waiting = Some(first);
+            stream.wait_for_time(first);
         }
         Ok(Response::new(Box::pin(stream.reports())))
     }
@@ -91,8 +93,8 @@ impl IngestService for Ingest {
 struct IngestStream {
     /// `None` once the stream reads no more observations.
     observations: Option<Streaming<v1::Observation>>,
-    /// Waits until the engine has time for it.
-    waiting: Option<v1::Observation>,
+    waiting: Option<Waiting>,
+    share: TimeShare,
     gateway: Arc<Gateway>,
     gateways: Gateways,
     session: ClientSession,
@@ -109,12 +111,14 @@ impl IngestStream {
         observations: Streaming<v1::Observation>,
         gateway: Arc<Gateway>,
         gateways: Gateways,
+        share: TimeShare,
         place: StreamPlace,
     ) -> Self {
         let (outcome_sender, outcomes) = unbounded_channel();
         Self {
             observations: Some(observations),
             waiting: None,
+            share,
             gateway,
             gateways,
             session: ClientSession::new(0),
@@ -150,11 +154,9 @@ impl IngestStream {
                 () = self.gateways.stopped(), if self.observations.is_some() => {
                     self.stop_reading(Some(Status::unavailable("the server stops")));
                 }
-                time = time_for(&self.gateway, self.waiting.as_ref()), if self.waiting.is_some() => {
-                    self.push_waiting(time);
-                }
+                time = Waiting::time(&mut self.waiting), if self.waiting.is_some() => self.push_waiting(time),
                 observation = next_observation(&mut self.observations), if has_credit => match observation {
-                    Ok(Some(observation)) => self.waiting = Some(observation),
+                    Ok(Some(observation)) => self.wait_for_time(observation),
                     Ok(None) => self.stop_reading(None),
                     Err(status) => {
                         if is_refusal(&status) {
@@ -174,10 +176,14 @@ impl IngestStream {
         self.session.begin(first.number, 0, 0);
     }
 
-    fn push_waiting(&mut self, time: EngineTime) {
-        let Some(mut observation) = self.waiting.take() else { return };
+    fn wait_for_time(&mut self, mut observation: v1::Observation) {
         observation.client = 0;
         let bytes = observation.encoded_len();
+        self.waiting = Some(self.gateway.time.wait(observation, bytes, &self.share));
+    }
+
+    fn push_waiting(&mut self, time: EngineTime) {
+        let Some(Waiting { observation, bytes, .. }) = self.waiting.take() else { return };
         if let Err(unknown) = self.gateway.push(observation, bytes, time, &mut self.session, &self.outcome_sender) {
             self.stop_reading(Some(unknown.into()));
         }
@@ -199,14 +205,6 @@ impl Drop for IngestStream {
 /// True if the message was too long or not an observation, false for a failure of the network.
 fn is_refusal(status: &Status) -> bool {
     matches!(status.code(), Code::OutOfRange | Code::Internal)
-}
-
-/// The engine's time for an observation; for ever if there is none.
-async fn time_for(gateway: &Gateway, observation: Option<&v1::Observation>) -> EngineTime {
-    match observation {
-        Some(observation) => gateway.wait_for_time(observation).await,
-        None => std::future::pending().await,
-    }
 }
 
 async fn next_observation(

@@ -4,10 +4,12 @@
 //! |---|---|
 //! | [`udp`] | UDP sockets -> batches of datagrams, by vehicle and sensor |
 //! | [`grpc`] | observations over gRPC -> gateway; reports back |
-//! | `zenoh` | observations over zenoh -> gateway; reports back |
+//! | `zenoh` | observations over zenoh -> a queue for each source |
+//! | `zenoh_source` | the queue of one source -> gateway; reports back |
 //! | [`gateway`] | one observation of a client -> events on the queue of its vehicle |
 //! | [`observation`] | `clearway.v1.Observation` -> event bodies, or the reason of the refusal |
 //! | [`stream_places`] | streams of senders -> places: so many at once, and never all for one sender |
+//! | [`engine_time`] | observations with points -> those that the engine has time for, a share for each sender |
 //! | [`receipt`] | outcome of an event -> report to its client |
 //! | [`ros`] | ROS 2 messages, live or from a file -> readings |
 //! | [`files`] | captures, MCAP files, scans -> readings |
@@ -15,6 +17,7 @@
 //! | [`drops`] | counts of readings that did not become events |
 
 pub mod drops;
+pub mod engine_time;
 pub mod files;
 pub mod gateway;
 pub mod grpc;
@@ -26,3 +29,5 @@ pub mod stream_places;
 pub mod udp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
+#[cfg(feature = "zenoh")]
+mod zenoh_source;

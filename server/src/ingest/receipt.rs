@@ -5,8 +5,9 @@ use std::collections::{BTreeSet, VecDeque};
 
 use clearway_mapping::error::EventError;
 use clearway_proto::v1;
-use tokio::sync::OwnedSemaphorePermit;
 use tokio::sync::mpsc::UnboundedSender;
+
+use super::engine_time::EngineTime;
 
 /// The outcome of one event.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -42,10 +43,6 @@ pub struct ObservationId {
 
 /// Where outcomes are sent. Unbounded, but it holds no more outcomes than there are events in flight.
 pub type OutcomeSender = UnboundedSender<(ObservationId, Outcome)>;
-
-/// The engine's time for waiting points, free again when this is dropped; `None` for an event without points.
-#[derive(Debug, Default)]
-pub struct EngineTime(pub Option<OwnedSemaphorePermit>);
 
 /// Delivers the outcome of one event exactly once. A receipt that is dropped undelivered, for example with the queue of
 /// a stopped engine, delivers a refusal with the reason `stopped`.

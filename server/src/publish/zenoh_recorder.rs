@@ -13,9 +13,8 @@ use zenoh::bytes::Encoding;
 use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::query::{Query, Queryable};
 
-use crate::ingest::zenoh::Senders;
 use crate::record::writer::{Command, ControlError, RecorderControl};
-use crate::zenoh_session::ZenohError;
+use crate::zenoh_session::{Senders, ZenohError};
 
 /// Greatest number of queries that wait for the recorder; the oldest of more ends without a reply. They do not delay
 /// other messages.

@@ -12,12 +12,12 @@ use crate::fleet::Fleet;
 use crate::ingest::gateway::Gateways;
 use crate::ingest::queue::EventQueue;
 use crate::ingest::ros::live::{self, LiveTopics};
-use crate::ingest::zenoh::{Ingest, Senders};
+use crate::ingest::zenoh::Ingest;
 use crate::publish::listen::access::Access;
 use crate::publish::zenoh::Publisher;
 use crate::publish::{Vehicles, announcements, zenoh_recorder};
 use crate::record::writer::RecorderControl;
-use crate::zenoh_session::{self, ZenohError};
+use crate::zenoh_session::{self, Senders, ZenohError};
 
 /// What of a server uses the session.
 #[derive(Clone)]

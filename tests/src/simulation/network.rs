@@ -1,7 +1,7 @@
 //! The networks between the car's sensors and the server: what the sensors send, with their faults, until it arrives.
 
 use bytes::Bytes;
-use clearway::ingest::receipt::EngineTime;
+use clearway::ingest::engine_time::EngineTime;
 use clearway::ingest::udp::DATAGRAM_BYTES_MAX;
 use clearway_mapping::event::{Body, Cause};
 use clearway_sim::vehicle::Datagram;

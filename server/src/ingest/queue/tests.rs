@@ -3,7 +3,8 @@
 use clearway_mapping::ledger::Ledger;
 
 use super::*;
-use crate::ingest::receipt::{EngineTime, ObservationId};
+use crate::ingest::engine_time::EngineTime;
+use crate::ingest::receipt::ObservationId;
 
 fn unreported(queue: &EventQueue) -> Ledger {
     let mut ledger = Ledger::default();
