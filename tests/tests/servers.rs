@@ -31,6 +31,20 @@ async fn client(running: &Running) -> Client {
     Client::connect(&running.grpc.unwrap().to_string()).await.unwrap()
 }
 
+/// What a client command of `clearway` prints about a server.
+async fn run(running: &Running, command: &[&str]) -> String {
+    let address = running.grpc.unwrap().to_string();
+    let arguments: Vec<_> = command.iter().copied().chain(["--server", &address]).map(str::to_owned).collect();
+    let ended = tokio::task::spawn_blocking(move || {
+        let arguments: Vec<_> = arguments.iter().map(String::as_str).collect();
+        clearway_tests::run(&clearway_tests::workspace(), "clearway", &arguments)
+    });
+    // Not `within` the time of a step, because it may build the command.
+    let output = ended.await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
 /// Names of the vehicles that a server lists.
 async fn listed(client: &Client) -> Vec<String> {
     let mut names: Vec<_> = client.vehicles().await.unwrap().into_iter().map(|vehicle| vehicle.name).collect();
@@ -70,6 +84,16 @@ async fn every_server_lists_the_vehicles_of_all_and_leads_a_planner_to_them() {
         let mut maps = within("a stream", anywhere.subscribe(subscription)).await.unwrap();
         let update = within("a map", maps.next()).await.unwrap();
         assert_eq!(update.map.header().boot_id, boot_id(running), "{vehicle}");
+    }
+    for command in [&["top", "--count", "1"][..], &["vehicles"]] {
+        let shown = run(&servers[0], command).await;
+        let line = |name: &str| shown.lines().find(|line| line.starts_with(name)).map(str::to_owned);
+        for running in &servers[1..] {
+            let of = &running.vehicles.0[0].status.name;
+            let line = line(of).unwrap_or_else(|| panic!("{command:?} without {of}: {shown}"));
+            assert!(line.contains(&format!("({})", running.grpc.unwrap())), "its server is not named: {shown}");
+        }
+        assert!(line("car").is_some(), "{shown}");
     }
     let unknown = anywhere.newest("tram", &[]).await.unwrap_err();
     assert!(matches!(&unknown, ClientError::Refused { reason, .. } if reason.contains("\"tram\"")), "{unknown}");

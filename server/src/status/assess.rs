@@ -1,6 +1,5 @@
 //! The status of a vehicle -> its state ([`super::health`]), at each call and five times a second.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -9,6 +8,8 @@ use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 
 use super::health::{Facts, SILENT_AFTER, SensorFacts, State};
+use super::json::run_text;
+use super::message::server_name;
 use super::vehicle::{Changing, VehicleStatus, packet_counts};
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
@@ -137,12 +138,17 @@ impl VehicleStatus {
         }
     }
 
-    /// Names of other servers that serve a vehicle of the same name, each once.
+    /// Names of other servers that serve a vehicle of the same name; with their runs if names do not tell them apart.
     fn claimed_by(&self) -> Vec<String> {
         let mut claims = locked(&self.claims);
         claims.retain(|_, (_, newest)| newest.elapsed() <= CLAIM_AGE_MAX);
-        let names: BTreeSet<_> = claims.values().map(|(server, _)| server.clone()).collect();
-        names.into_iter().collect()
+        let count = |name: &str| claims.values().filter(|(server, _)| server == name).count();
+        let text =
+            |(boot_id, (server, _)): (&u64, &(String, Instant))| match count(server) > 1 || server == server_name() {
+                true => format!("{server} ({})", run_text(*boot_id)),
+                false => server.clone(),
+            };
+        claims.iter().map(text).collect()
     }
 }
 

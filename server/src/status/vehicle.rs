@@ -484,9 +484,14 @@ mod tests {
         assert_eq!(status.assess().claimed_by, Vec::<String>::new());
         status.note_claim("8", "b\u{1b}[2J");
         assert_eq!(status.assess().claimed_by, ["b[2J"]);
+        status.note_claim("1311768467463790320", "b\u{1b}[2J");
+        assert_eq!(status.assess().claimed_by, ["b[2J (run 00000000)", "b[2J (run 12345678)"], "two of one name");
         (100..200).for_each(|boot_id: u64| status.note_claim(&boot_id.to_string(), &format!("{boot_id:>99}")));
         let claimed_by = status.assess().claimed_by;
-        assert!(claimed_by.len() <= CLAIMS_MAX && claimed_by.iter().all(|name| name.len() <= SERVER_NAME_MAX));
+        assert!(
+            claimed_by.len() <= CLAIMS_MAX
+                && claimed_by.iter().all(|name| name.len() <= SERVER_NAME_MAX + " (run 12345678)".len())
+        );
     }
 
     #[test]
