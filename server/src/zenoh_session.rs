@@ -85,8 +85,8 @@ pub(crate) fn settings<'a>(
     Ok(config)
 }
 
-/// The settings of a second session beside that of the server, which only reads; `None` if the file of `[zenoh]` has the
-/// id of the session, because two sessions with one id are refused.
+/// The settings of a second session beside that of the server, which only reads; `None` if the file of `[zenoh]` has
+/// the id of the session, because two sessions with one id are refused.
 ///
 /// # Errors
 /// [`ZenohError`] as for [`settings`].
