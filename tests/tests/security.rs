@@ -3,8 +3,10 @@
 mod fixture;
 
 use std::fs::Permissions;
+use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 
 use clearway::cli::make::replay::{Options, Summary, replay};
@@ -375,4 +377,32 @@ async fn a_certificate_that_has_ended_is_named_in_the_status_while_serving_goes_
     until("the certificate is not named", || named().is_none()).await;
     assert_eq!(vehicles(&running, &reader).await.unwrap(), 1);
     within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[test]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
+fn a_certificate_that_ends_soon_is_in_the_log_with_what_to_do() {
+    let (folder, mut config) = (certificates("ours"), secured(true));
+    let of_server = config.grpc.tls.as_mut().expect("it has certificates");
+    (of_server.certificate, of_server.key) = (folder.join("soon.pem"), folder.join("soon.key"));
+    let written = tempfile::tempdir().unwrap();
+    let path = written.path().join("clearway.toml");
+    std::fs::write(&path, config.to_toml()).unwrap();
+    let mut server = Command::new(clearway_tests::binaries().join("clearway"));
+    server.args(["serve", "--config"]).arg(&path).stdout(Stdio::null()).stderr(Stdio::piped());
+    let mut server = server.spawn().expect("clearway starts");
+    // Without the line the server is ended after the time that any step of these tests needs.
+    let (found, is_found) = std::sync::mpsc::channel();
+    let lines = BufReader::new(server.stderr.take().expect("piped")).lines().map_while(Result::ok);
+    let reading = std::thread::spawn(move || {
+        lines.filter(|line| line.contains("certificate of grpc.tls.certificate")).for_each(|line| _ = found.send(line));
+    });
+    let line = is_found.recv_timeout(std::time::Duration::from_secs(60));
+    server.kill().unwrap();
+    server.wait().unwrap();
+    reading.join().unwrap();
+    let line = line.expect("the certificate is in the log");
+    for words in ["WARN", "ends in 47 h", "write a new one there, then SIGHUP"] {
+        assert!(line.contains(words), "{words}: {line}");
+    }
 }

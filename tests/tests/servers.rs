@@ -6,14 +6,19 @@ mod fixture;
 use clearway::config::ZenohMode;
 use clearway::server::Running;
 use clearway_client::{Client, ClientError, Subscription, ZenohClient};
-use fixture::routers::router;
+use fixture::routers::{router, router_with};
 use fixture::{config, feed, readings, start, until, within};
 
 /// A server with one vehicle of this name, behind a router, with one map.
 async fn server(vehicle: &str, router: &str) -> Running {
+    server_at(vehicle, router, "127.0.0.1").await
+}
+
+/// As [`server`], which announces that it is at this host; empty: as by default.
+async fn server_at(vehicle: &str, router: &str, host: &str) -> Running {
     let mut config = config();
     config.vehicles[0].name = vehicle.into();
-    config.grpc.advertise = "127.0.0.1".into();
+    config.grpc.advertise = host.into();
     config.zenoh.enabled = true;
     (config.zenoh.mode, config.zenoh.listen) = (ZenohMode::Client, Vec::new());
     config.zenoh.connect = vec![router.into()];
@@ -24,6 +29,20 @@ async fn server(vehicle: &str, router: &str) -> Running {
 
 async fn client(running: &Running) -> Client {
     Client::connect(&running.grpc.unwrap().to_string()).await.unwrap()
+}
+
+/// What a client command of `clearway` prints about a server.
+async fn run(running: &Running, command: &[&str]) -> String {
+    let address = running.grpc.unwrap().to_string();
+    let arguments: Vec<_> = command.iter().copied().chain(["--server", &address]).map(str::to_owned).collect();
+    let ended = tokio::task::spawn_blocking(move || {
+        let arguments: Vec<_> = arguments.iter().map(String::as_str).collect();
+        clearway_tests::run(&clearway_tests::workspace(), "clearway", &arguments)
+    });
+    // Not `within` the time of a step, because it may build the command.
+    let output = ended.await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
 }
 
 /// Names of the vehicles that a server lists.
@@ -66,6 +85,16 @@ async fn every_server_lists_the_vehicles_of_all_and_leads_a_planner_to_them() {
         let update = within("a map", maps.next()).await.unwrap();
         assert_eq!(update.map.header().boot_id, boot_id(running), "{vehicle}");
     }
+    for command in [&["top", "--count", "1"][..], &["vehicles"]] {
+        let shown = run(&servers[0], command).await;
+        let line = |name: &str| shown.lines().find(|line| line.starts_with(name)).map(str::to_owned);
+        for running in &servers[1..] {
+            let of = &running.vehicles.0[0].status.name;
+            let line = line(of).unwrap_or_else(|| panic!("{command:?} without {of}: {shown}"));
+            assert!(line.contains(&format!("({})", running.grpc.unwrap())), "its server is not named: {shown}");
+        }
+        assert!(line("car").is_some(), "{shown}");
+    }
     let unknown = anywhere.newest("tram", &[]).await.unwrap_err();
     assert!(matches!(&unknown, ClientError::Refused { reason, .. } if reason.contains("\"tram\"")), "{unknown}");
 
@@ -106,12 +135,18 @@ async fn two_servers_that_claim_one_vehicle_are_both_listed_and_a_planner_keeps_
 
 /// Waits until the status of a server's vehicle names a router that is away with all of these words, or none.
 async fn away(running: &Running, words: &[&str]) {
+    named(running, "no zenoh router", words).await;
+}
+
+/// Waits until the status of a server's vehicle has a reason that starts so, with all of these words; without words,
+/// until it has none that starts so.
+async fn named(running: &Running, start: &str, words: &[&str]) {
     let is_named = || {
         let reasons = running.vehicles.0[0].status.assess().reasons;
-        let named = reasons.iter().find(|reason| reason.starts_with("no zenoh router"));
+        let named = reasons.iter().find(|reason| reason.starts_with(start));
         named.map_or(words.is_empty(), |reason| !words.is_empty() && words.iter().all(|word| reason.contains(word)))
     };
-    until(&format!("the router is named by {words:?}"), is_named).await;
+    until(&format!("{start:?} with {words:?}"), is_named).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
@@ -147,4 +182,43 @@ async fn a_router_that_accepts_connections_and_no_session_is_named_while_serving
     away(&car, &[&at, "accepts connections but no session"]).await;
     within("shutdown", car.shutdown()).await.unwrap();
     closing.abort();
+}
+
+/// Access control that lets clients do everything but publish.
+const NO_PUT: &str = r#"{
+  enabled: true, default_permission: "allow",
+  rules: [{ id: "put", permission: "deny", messages: ["put"], flows: ["ingress"], key_exprs: ["**"] }],
+  subjects: [{ id: "every client" }],
+  policies: [{ rules: ["put"], subjects: ["every client"] }],
+}"#;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_router_that_lets_a_server_publish_nothing_is_named_until_it_does() {
+    let (denying, at) = router_with(0, &[], NO_PUT).await;
+    let car = within("a server", server("car", &at)).await;
+    let start = "the zenoh router";
+    named(&car, start, &[&at, "clearway/car/status", "access control"]).await;
+    assert!(within("a map over gRPC", client(&car).await.newest("car", &[])).await.is_ok());
+    within("the router goes", denying.close().into_future()).await.unwrap();
+    let port = at.rsplit_once(':').and_then(|(_, port)| port.parse().ok()).unwrap();
+    let (allowing, _) = router(port, &[]).await;
+    named(&car, start, &[]).await;
+    within("shutdown", car.shutdown()).await.unwrap();
+    allowing.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_vehicle_of_a_server_that_announces_no_address_is_refused_with_what_to_set_there() {
+    let (router, at) = router(0, &[]).await;
+    let (car, van) = (server("car", &at).await, server_at("van", &at, "").await);
+    let anywhere = client(&car).await;
+    lists(&anywhere, &["car", "van"]).await;
+    let refused = anywhere.newest("van", &[]).await.unwrap_err().to_string();
+    for word in ["\"van\"", "announces no address", "grpc.advertise"] {
+        assert!(refused.contains(word), "{refused}");
+    }
+    for running in [car, van] {
+        within("shutdown", running.shutdown()).await.unwrap();
+    }
+    router.close().await.unwrap();
 }

@@ -12,8 +12,11 @@
 //! | `uploads` | finished parts of the recording -> the store |
 //! | `over_zenoh` | everything that uses the zenoh session |
 //! | `opening` | a router that answers, at the start or later -> the session |
+//! | `delivery` | whether the router delivers what this server publishes -> status and log |
 //! | `router` | whether a router is connected -> status and log |
 
+#[cfg(feature = "zenoh")]
+mod delivery;
 mod input;
 mod listeners;
 #[cfg(feature = "zenoh")]

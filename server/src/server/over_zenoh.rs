@@ -6,6 +6,7 @@ use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::pubsub::Subscriber;
 
+use super::delivery::watch_delivery;
 use super::router::watch_router;
 use crate::config::{Config, ZenohMode};
 use crate::fleet::Fleet;
@@ -40,7 +41,7 @@ pub(super) struct OverZenoh {
     /// One task a vehicle.
     ingest: JoinSet<()>,
     ros: Vec<LiveTopics>,
-    /// One task a vehicle, and one that watches the router.
+    /// One task a vehicle, and two that watch the router.
     announcements: JoinSet<()>,
     /// One task a vehicle.
     recorder: JoinSet<()>,
@@ -63,6 +64,10 @@ impl OverZenoh {
         }
         if config.zenoh.mode == ZenohMode::Client {
             announcements.spawn(watch_router(session.clone(), config.zenoh.connect.clone(), vehicles.clone()));
+            if let Some(reader) = zenoh_session::reader_settings(&config.zenoh)? {
+                let watch = watch_delivery(session.clone(), reader, config.zenoh.clone(), vehicles.clone());
+                announcements.spawn(watch);
+            }
         }
         let others = match config.zenoh.fleet.list {
             true => Some(announcements::hear(&session, fleet.clone()).await?),

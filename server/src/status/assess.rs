@@ -1,6 +1,5 @@
 //! The status of a vehicle -> its state ([`super::health`]), at each call and five times a second.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -9,6 +8,8 @@ use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 
 use super::health::{Facts, SILENT_AFTER, SensorFacts, State};
+use super::json::run_text;
+use super::message::server_name;
 use super::vehicle::{Changing, VehicleStatus, packet_counts};
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
@@ -137,12 +138,17 @@ impl VehicleStatus {
         }
     }
 
-    /// Names of other servers that serve a vehicle of the same name, each once.
+    /// Names of other servers that serve a vehicle of the same name; with their runs if names do not tell them apart.
     fn claimed_by(&self) -> Vec<String> {
         let mut claims = locked(&self.claims);
         claims.retain(|_, (_, newest)| newest.elapsed() <= CLAIM_AGE_MAX);
-        let names: BTreeSet<_> = claims.values().map(|(server, _)| server.clone()).collect();
-        names.into_iter().collect()
+        let count = |name: &str| claims.values().filter(|(server, _)| server == name).count();
+        let text =
+            |(boot_id, (server, _)): (&u64, &(String, Instant))| match count(server) > 1 || server == server_name() {
+                true => format!("{server} ({})", run_text(*boot_id)),
+                false => server.clone(),
+            };
+        claims.iter().map(text).collect()
     }
 }
 
@@ -166,5 +172,29 @@ fn sensor_facts(sensor: &clearway_mapping::pipeline::NamedStatus, changing: &Cha
             .mount
             .filter(|mount| mount.contradicts)
             .map(|mount| [mount.height_m, mount.pitch_rad.to_degrees(), mount.roll_rad.to_degrees()]),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::vehicle::{CLAIMS_MAX, SERVER_NAME_MAX};
+
+    #[test]
+    fn another_server_that_claims_the_vehicle_is_named_and_a_flood_of_claims_is_bounded() {
+        let status = VehicleStatus::new("car".into(), 7, vec![], Arc::default());
+        status.note_claim("7", "itself");
+        status.note_claim("no number", "liar");
+        assert_eq!(status.assess().claimed_by, Vec::<String>::new());
+        status.note_claim("8", "b\u{1b}[2J");
+        assert_eq!(status.assess().claimed_by, ["b[2J"]);
+        status.note_claim("1311768467463790320", "b\u{1b}[2J");
+        assert_eq!(status.assess().claimed_by, ["b[2J (run 00000000)", "b[2J (run 12345678)"], "two of one name");
+        (100..200).for_each(|boot_id: u64| status.note_claim(&boot_id.to_string(), &format!("{boot_id:>99}")));
+        let claimed_by = status.assess().claimed_by;
+        assert!(
+            claimed_by.len() <= CLAIMS_MAX
+                && claimed_by.iter().all(|name| name.len() <= SERVER_NAME_MAX + " (run 12345678)".len())
+        );
     }
 }

@@ -4,6 +4,11 @@
 use clearway_proto::v1;
 use serde_json::{Value, json};
 
+/// A run of a server in short: the first half of its boot id in hexadecimal, as in the keys of its announcements.
+pub fn run_text(boot_id: u64) -> String {
+    format!("run {:08x}", boot_id >> 32)
+}
+
 /// The state of one sensor as a JSON object: the fields of [`v1::SensorState`] under their own names, and a blocked
 /// sector as `[from_deg, to_deg]`.
 pub fn sensor_json(state: &v1::SensorState) -> Value {
@@ -57,6 +62,7 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
         "map_bytes": vehicle.map_bytes,
         "skips": vehicle.skips,
         "server": vehicle.server,
+        "run": run_text(vehicle.boot_id),
         "grpc": vehicle.grpc,
         "page": vehicle.page,
         "claimed_by": vehicle.claimed_by,

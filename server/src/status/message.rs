@@ -129,7 +129,7 @@ fn by_name(counts: &BTreeMap<&'static str, u64>) -> BTreeMap<String, u64> {
 }
 
 /// Name of the host on which the server runs; `localhost` if the system does not tell it.
-fn server_name() -> &'static str {
+pub(super) fn server_name() -> &'static str {
     static NAME: OnceLock<String> = OnceLock::new();
     NAME.get_or_init(|| {
         let name = nix::unistd::gethostname().ok().and_then(|name| name.into_string().ok());

@@ -35,7 +35,7 @@ pub mod window;
 
 pub use assess::{state_changed, watch_states};
 pub use health::State;
-pub use json::{recorder_json, sensor_json, vehicle_json};
+pub use json::{recorder_json, run_text, sensor_json, vehicle_json};
 pub use metrics::prometheus;
 pub use text_format::Format;
 pub use transports::{Reader, Transport};

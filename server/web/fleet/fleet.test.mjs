@@ -64,7 +64,10 @@ test("all vehicles are on the map, x to the right and y up, and a click finds th
 test("a vehicle of another server has its own key, says who serves it, and links to that server's page alone", () => {
   const van = elsewhere({ name: "van", server: "b", grpc: "b:1", page: "https://b:8080/", reasons: ["old"] });
   assert.equal(van.key, "van @ b @ b:1");
-  assert.deepEqual(stateOf(van).reasons, ["served by b", "old"]);
+  assert.deepEqual(stateOf(van).reasons, ["served by b (b:1)", "old"]);
+  const [first, second] = ["run 1", "run 2"].map((run) => elsewhere({ name: "van", server: "b", grpc: "", run }));
+  assert.notEqual(first.key, second.key);
+  assert.deepEqual(stateOf(first).reasons, ["served by b (run 1)"]);
   assert.equal(addressOf(van), "https://b:8080/?vehicle=van");
   assert.equal(addressOf({ name: "a b" }), "?vehicle=a%20b");
   for (const page of [undefined, "", "b:8080", "javascript:alert(1)"]) assert.equal(addressOf({ ...van, page }), null);

@@ -6,8 +6,8 @@ const NEWS_MS = 2500;
 
 // A vehicle of another server, as that server says it. Two servers may claim one name: its card has a key of its own.
 export const elsewhere = (status) => {
-  const { name, server, grpc } = status;
-  return { ...status, is_elsewhere: true, key: [name, server, grpc].join(" @ ") };
+  const { name, server, grpc, run } = status;
+  return { ...status, is_elsewhere: true, key: [name, server, grpc || run].join(" @ ") };
 };
 
 // Where a click on a vehicle's card leads: its view here, or the page of its server; null if that has none for others.
@@ -20,7 +20,7 @@ export function addressOf({ name, is_elsewhere, page }) {
 export function stateOf(status) {
   const state = Object.hasOwn(ORDER, status?.state ?? "") ? status.state : null;
   const claimed = status?.claimed_by?.length ? [`also claimed by ${status.claimed_by.join(", ")}`] : [];
-  const served = status?.is_elsewhere ? [`served by ${status.server}`] : [];
+  const served = status?.is_elsewhere ? [`served by ${status.server} (${status.grpc || status.run})`] : [];
   return { state, reasons: [...served, ...(status?.reasons ?? []), ...claimed] };
 }
 

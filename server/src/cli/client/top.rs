@@ -1,17 +1,22 @@
-//! `clearway top`: a server -> a live table of its vehicles, the worst first.
+//! `clearway top`: a server -> a live table of its vehicles and those of the servers it knows, the worst first.
 
 use anyhow::Result;
 use clap::Args;
-use clearway_client::v1;
-use console::{Style, truncate_str};
+use clearway_client::{Client, v1};
+use console::{Alignment, Style, measure_text_width, pad_str, truncate_str};
 use futures::StreamExt;
 
 use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::client::fleet::{is_of_several_servers, server_text};
 use crate::cli::client::screen::Screen;
 use crate::cli::shared::output::{self, block_on, counted, stop_signal};
 
-/// Show the vehicles of a server live: state, age, rate, loss, latency, readers, and what is wrong.
+/// Widest column of servers, in characters.
+const SERVER_COLUMNS_MAX: usize = 32;
+
+/// Show the vehicles of a fleet live: state, age, rate, loss, latency, readers, and what is wrong.
 ///
+/// The vehicles are those of the server and of the servers it knows, which announce theirs once a second.
 /// The table is renewed once a second and whenever a state changes, the worst vehicle first; Ctrl-C ends it. If stdout
 /// is not a terminal, each table follows the one before.
 #[derive(Args)]
@@ -44,7 +49,8 @@ pub fn run(options: &Options) -> Result<()> {
 
 async fn show(options: &Options, screen: &Screen) -> Result<()> {
     let stop = stop_signal()?;
-    let mut updates = options.server.connect().await?.watch_status(&options.vehicles).await.map_err(explain)?;
+    let client = options.server.connect().await?;
+    let mut updates = client.watch_status(&[]).await.map_err(explain)?;
     let mut shown = 0;
     tokio::pin!(stop);
     while options.count.is_none_or(|count| shown < count) {
@@ -53,7 +59,11 @@ async fn show(options: &Options, screen: &Screen) -> Result<()> {
             update = updates.next() => update,
         };
         let Some(update) = update else { break };
-        let vehicles = update.map_err(explain)?;
+        let own = update.map_err(explain)?;
+        let vehicles = with_others(own, client.vehicles().await.map_err(explain)?, &options.vehicles);
+        if shown == 0 {
+            check(&client, &vehicles, &options.vehicles).await?;
+        }
         if !screen.show(&table(vehicles, screen.size().1, screen.is_live()))? {
             break;
         }
@@ -62,11 +72,36 @@ async fn show(options: &Options, screen: &Screen) -> Result<()> {
     Ok(())
 }
 
+/// The server's own vehicles and, of a list, those of other servers; of these the ones with these names, or all.
+fn with_others(own: Vec<v1::Vehicle>, list: Vec<v1::Vehicle>, names: &[String]) -> Vec<v1::Vehicle> {
+    let is_own = |of: &v1::Vehicle| own.iter().any(|own| (&own.name, own.boot_id) == (&of.name, of.boot_id));
+    let others: Vec<_> = list.into_iter().filter(|of| !is_own(of)).collect();
+    let is_named = |of: &v1::Vehicle| names.is_empty() || names.contains(&of.name);
+    own.into_iter().chain(others).filter(is_named).collect()
+}
+
+/// Checks that there is a vehicle of each name; if not, the server says why.
+async fn check(client: &Client, vehicles: &[v1::Vehicle], names: &[String]) -> Result<()> {
+    let is_missing = |name: &&String| !vehicles.iter().any(|vehicle| vehicle.name == **name);
+    let missing: Vec<_> = names.iter().filter(is_missing).cloned().collect();
+    if !missing.is_empty() {
+        drop(client.watch_status(&missing).await.map_err(explain)?);
+    }
+    Ok(())
+}
+
 /// The lines of the table, none longer than `columns`: a line for each vehicle and one for each reason, the worst
 /// vehicles first. Text of the server is shown without control characters.
 fn table(mut vehicles: Vec<v1::Vehicle>, columns: usize, is_coloured: bool) -> Vec<String> {
+    let is_fleet = is_of_several_servers(&vehicles);
     let severity = |state: &str| ["error", "warn", "ok"].iter().position(|known| *known == state).unwrap_or(1);
-    vehicles.sort_by(|a, b| (severity(&a.state), &a.name).cmp(&(severity(&b.state), &b.name)));
+    vehicles.sort_by_cached_key(|of| (severity(&of.state), of.name.clone(), server_text(of)));
+    let servers: Vec<_> = vehicles.iter().map(|of| printable(&server_text(of))).collect();
+    let wide = servers.iter().map(|text| measure_text_width(text)).max().unwrap_or(0).min(SERVER_COLUMNS_MAX);
+    let column = |text: &str| match is_fleet {
+        true => pad_str(&truncate_str(text, wide, "…"), wide, Alignment::Left, None).into_owned() + " ",
+        false => String::new(),
+    };
     let count = |state: &str| vehicles.iter().filter(|vehicle| vehicle.state == state).count();
     let cut = |line: String| truncate_str(&line, columns, "…").into_owned();
     let mut lines = vec![
@@ -78,25 +113,36 @@ fn table(mut vehicles: Vec<v1::Vehicle>, columns: usize, is_coloured: bool) -> V
             count("ok")
         )),
         cut(format!(
-            "{:<16} {:<5} {:>8} {:>6} {:>6} {:>7} {:>8} {:>6} {:>7} {:>6} {:>7}",
-            "VEHICLE", "STATE", "AGE", "MAPS/s", "LOSS", "LATENCY", "KB/MAP", "DRIVE", "READERS", "SKIPS", "SPEED"
+            "{:<16} {}{:<5} {:>8} {:>6} {:>6} {:>7} {:>8} {:>6} {:>7} {:>6} {:>7}",
+            "VEHICLE",
+            column("SERVER"),
+            "STATE",
+            "AGE",
+            "MAPS/s",
+            "LOSS",
+            "LATENCY",
+            "KB/MAP",
+            "DRIVE",
+            "READERS",
+            "SKIPS",
+            "SPEED"
         )),
     ];
-    for vehicle in &vehicles {
+    for (vehicle, server) in vehicles.iter().zip(&servers) {
         let style = match (is_coloured, severity(&vehicle.state)) {
             (false, _) => Style::new(),
             (true, 0) => Style::new().force_styling(true).red().bold(),
             (true, 1) => Style::new().force_styling(true).yellow(),
             (true, _) => Style::new().force_styling(true).green(),
         };
-        lines.push(style.apply_to(cut(row(vehicle))).to_string());
+        lines.push(style.apply_to(cut(row(vehicle, &column(server)))).to_string());
         lines.extend(vehicle.reasons.iter().map(|reason| cut(format!("    {}", printable(reason)))));
     }
     lines
 }
 
-/// The line of one vehicle; a dash stands for what is not known.
-fn row(vehicle: &v1::Vehicle) -> String {
+/// The line of one vehicle, with the text of its server's column; a dash stands for what is not known.
+fn row(vehicle: &v1::Vehicle, server: &str) -> String {
     let or_dash = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
     let age = or_dash(vehicle.map_age_ms.map(age));
     let latency = or_dash(vehicle.latency_ms.get("total").map(|ms| format!("{ms:.0} ms")));
@@ -104,7 +150,7 @@ fn row(vehicle: &v1::Vehicle) -> String {
     let speed = or_dash(vehicle.speed_m_s.map(|speed| format!("{speed:.1}")));
     let (readers, skips): (u32, u64) = (vehicle.readers.values().sum(), vehicle.skips.values().sum());
     format!(
-        "{:<16} {:<5} {age:>8} {:>6.1} {:>6} {latency:>7} {:>8.1} {share:>6} {readers:>7} {skips:>6} {speed:>7}",
+        "{:<16} {server}{:<5} {age:>8} {:>6.1} {:>6} {latency:>7} {:>8.1} {share:>6} {readers:>7} {skips:>6} {speed:>7}",
         truncate_str(&printable(&vehicle.name), 16, "…"),
         printable(&vehicle.state).to_uppercase(),
         vehicle.map_rate_hz,
@@ -160,6 +206,28 @@ mod tests {
         assert_eq!(words.join(" "), expected);
         // Each value stands under its name.
         assert_eq!(lines[1].chars().count(), lines[5].chars().count());
+    }
+
+    #[test]
+    fn vehicles_of_other_servers_stand_in_the_table_each_with_a_server_of_its_own() {
+        let of = |name: &str, boot_id: u64, grpc: &str| v1::Vehicle {
+            boot_id,
+            server: "b".into(),
+            grpc: grpc.into(),
+            ..vehicle(name, "ok")
+        };
+        let own = vec![of("car", 1 << 60, "")];
+        let list = vec![of("car", 1 << 60, ""), of("van", 2, "b:1"), of("van", 3, "b:2"), of("bus", 3, "b:2")];
+        let all = table(with_others(own.clone(), list.clone(), &[]), 120, false);
+        assert_eq!(all[0], "4 vehicles: 0 error, 0 warn, 4 ok");
+        let shown: Vec<_> = all[2..].iter().map(|line| line.split(" OK ").next().unwrap().trim_end()).collect();
+        let column = |name: &str, server: &str| format!("{name:<16} {server}");
+        let rows = [("bus", "b (b:2)"), ("car", "b (run 10000000)"), ("van", "b (b:1)"), ("van", "b (b:2)")];
+        assert_eq!(shown, rows.map(|(name, server)| column(name, server)));
+        assert!(all[1].contains("SERVER") && all.iter().skip(2).all(|line| line.len() == all[1].len()), "{all:?}");
+        let one = with_others(own.clone(), list, &["van".into()]);
+        assert_eq!(one.iter().map(|of| &*of.grpc).collect::<Vec<_>>(), ["b:1", "b:2"]);
+        assert!(!table(own, 120, false)[1].contains("SERVER"), "one server needs no column");
     }
 
     #[test]

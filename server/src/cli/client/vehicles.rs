@@ -6,10 +6,11 @@ use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
 use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::client::fleet::{is_of_several_servers, server_text};
 use crate::cli::shared::output::{block_on, counted, print_line};
 use crate::status::vehicle_json;
 
-/// List the vehicles of a server: maps, sensors, refused and lost datagrams, readers, recording.
+/// List the vehicles of a server and of those it knows: maps, sensors, refused and lost datagrams, readers, recording.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway vehicles
@@ -38,7 +39,8 @@ async fn list(options: &Options) -> Result<()> {
         print_line(&serde_json::to_string_pretty(&documents)?)?;
         return Ok(());
     }
-    for line in vehicles.iter().flat_map(|vehicle| lines(vehicle, now)) {
+    let is_fleet = is_of_several_servers(&vehicles);
+    for line in vehicles.iter().flat_map(|vehicle| lines(vehicle, is_fleet, now)) {
         print_line(&line)?;
     }
     if vehicles.is_empty() {
@@ -63,11 +65,12 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
     document
 }
 
-/// The lines for one vehicle.
-fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
+/// The lines for one vehicle, with its server if there are several.
+fn lines(vehicle: &v1::Vehicle, is_fleet: bool, now: i64) -> Vec<String> {
     let age = age_ms(vehicle, now).map_or("none yet".to_owned(), |age| format!("newest {age:.0} ms old"));
+    let server = if is_fleet { format!(" on {}", server_text(vehicle)) } else { String::new() };
     let mut lines = vec![format!(
-        "{}: {}, {age}; layers {}",
+        "{}{server}: {}, {age}; layers {}",
         vehicle.name,
         counted(vehicle.maps, "map"),
         vehicle.layers.join(", ")
