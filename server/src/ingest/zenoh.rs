@@ -1,16 +1,16 @@
 //! Observations over zenoh: `clearway/<vehicle>/ingest/{scan,packet,end,sensor}/<sensor>` and `.../{pose,road}`;
 //! reports go to `clearway/<vehicle>/ingest/report`.
 //!
-//! zenoh's callback only queues a sample: each source has a queue of its own, within bounds, and what is in it is
-//! decoded in its order, independently of the others ([`Source`]). A source is the zenoh
-//! session that a sample names (zenoh's `source_info`); samples without it share one queue. A sample that exceeds a
-//! bound is counted as `queue`, and its client learns of it because its numbers then have a gap. Reports are dropped
-//! under congestion, so that a stopped peer does not delay the others; the newest acknowledgement is therefore repeated
-//! for a while.
+//! A source is the zenoh session that a sample names (zenoh's `source_info`). zenoh's callback only puts a sample into
+//! the queue of its source, within bounds; samples that name no session share one queue. The samples of a queue are
+//! decoded in their order, and do not wait for those of another queue ([`Source`]). A sample that exceeds a bound is
+//! counted as `queue`, and its client learns of it because its numbers then have a gap. Reports are dropped under
+//! congestion, so that a stopped peer does not delay the others; the newest acknowledgement is therefore repeated for a
+//! while.
 //!
 //! With roles ([`Senders`]) a sample needs a certificate with the role of an ingester, as over gRPC. zenoh's access
 //! control refuses the others first; this check also holds if it is configured otherwise. Without roles a sender may
-//! name any session, also another one; it then has no more queues than there are.
+//! name any session, also that of another sender.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -33,8 +33,8 @@ use crate::zenoh_session::{Senders, ZenohError};
 
 /// Greatest number of queued samples of one source.
 const SAMPLES_MAX: usize = 256;
-/// Greatest number of sources of one vehicle. A new source replaces the one that was silent longest. Ours: the sensors
-/// of a vehicle seldom have more than one session each.
+/// Greatest number of sources of one vehicle. A new source replaces the one that was silent longest, of those without
+/// queued samples. Ours: the sensors of a vehicle seldom have more than one session each.
 const SOURCES_MAX: usize = 16;
 /// A source that has sent within this time is not replaced. Ours: ten revolutions.
 const RECENT: Duration = Duration::from_secs(1);
@@ -107,10 +107,10 @@ struct Queues {
     all: Vec<Queue>,
     /// Where a new source is sent.
     opened: UnboundedSender<Source>,
-    /// Bytes that are queued of all sources.
+    /// Bytes of the queued samples of all sources.
     bytes: Arc<AtomicUsize>,
-    /// One reference for each source.
-    sources: Arc<()>,
+    /// Number of queues.
+    count: Arc<AtomicUsize>,
     gateway: Arc<Gateway>,
 }
 
@@ -118,21 +118,20 @@ struct Queues {
 struct Queue {
     source: Option<ZenohId>,
     samples: Sender<QueuedSample>,
+    /// Bytes of its queued samples.
     bytes: Arc<AtomicUsize>,
     /// When its newest sample came.
     heard: Instant,
-    _source: Arc<()>,
 }
 
 impl Queues {
     fn new(gateway: Arc<Gateway>) -> (Self, UnboundedReceiver<Source>) {
         let (opened, receiver) = unbounded_channel();
-        (Self { all: Vec::new(), opened, bytes: Arc::default(), sources: Arc::default(), gateway }, receiver)
+        (Self { all: Vec::new(), opened, bytes: Arc::default(), count: Arc::default(), gateway }, receiver)
     }
 
-    /// Queues a sample; false if it exceeds a bound. A source has half the bytes of the vehicle's longest message
-    /// queued before its newest sample, and all sources together have four times as many as that message; but each may
-    /// always have one sample.
+    /// Queues a sample. False if it exceeds a bound: a source with queued samples gets another one only while they have
+    /// at most half the bytes of the vehicle's longest message, and those of all sources at most four times its bytes.
     fn push(&mut self, source: Option<ZenohId>, key: &str, payload: &ZBytes, now: Instant) -> bool {
         let bytes_max = self.gateway.limits.message_bytes_max;
         let of_vehicle = self.bytes.clone();
@@ -146,28 +145,31 @@ impl Queues {
         queue.samples.try_send(QueuedSample { key: key.to_owned(), payload: payload.clone(), queued }).is_ok()
     }
 
-    /// The queue of this source; `None` if it is new and all others have sent recently.
+    /// The queue of this source; `None` if it is new and every other has sent recently or has queued samples.
     fn get_or_open(&mut self, source: Option<ZenohId>, now: Instant) -> Option<&mut Queue> {
         if let Some(at) = self.all.iter().position(|queue| queue.source == source) {
             return self.all.get_mut(at);
         }
         if self.all.len() >= SOURCES_MAX {
-            let silent = |(_, queue): &(usize, &Queue)| now.saturating_duration_since(queue.heard) > RECENT;
-            let (longest, _) = self.all.iter().enumerate().filter(silent).min_by_key(|(_, queue)| queue.heard)?;
+            let may_end = |(_, queue): &(usize, &Queue)| {
+                now.saturating_duration_since(queue.heard) > RECENT && queue.bytes.load(Ordering::Relaxed) == 0
+            };
+            let ending = self.all.iter().enumerate().filter(may_end);
+            let (longest, _) = ending.min_by_key(|(_, queue)| queue.heard)?;
             self.all.remove(longest);
         }
         let (samples, receiver) = channel(SAMPLES_MAX);
-        let of_all = Arc::downgrade(&self.sources);
-        let opened = Source::new(source, receiver, of_all, self.gateway.time.share());
+        let opened = Source::new(source, receiver, self.count.clone(), self.gateway.time.share());
         // An error means that the server stops.
         self.opened.send(opened).ok()?;
-        let of_it = self.sources.clone();
-        Some(self.all.push_mut(Queue { source, samples, bytes: Arc::default(), heard: now, _source: of_it }))
+        self.count.store(self.all.len() + 1, Ordering::Relaxed);
+        Some(self.all.push_mut(Queue { source, samples, bytes: Arc::default(), heard: now }))
     }
 
     /// Ends the sources that were silent for [`SILENT_MAX`].
     fn end_silent(&mut self, now: Instant) {
         self.all.retain(|queue| now.saturating_duration_since(queue.heard) <= SILENT_MAX);
+        self.count.store(self.all.len(), Ordering::Relaxed);
     }
 }
 
@@ -207,21 +209,19 @@ mod tests {
         let (mut queues, mut opened) = queues(1000);
         let now = Instant::now();
         let large = ZBytes::from(vec![0; 97_000]);
-        for source in 1..=SOURCES_MAX as u8 {
+        let small = ZBytes::from(vec![0; 10]);
+        assert!(queues.push(session(1), "pose", &small, now));
+        for source in 2..=SOURCES_MAX as u8 {
             assert!(queues.push(session(source), "scan/top", &large, now), "source {source}");
         }
-        let small = ZBytes::from(vec![0; 10]);
-        assert!(!queues.push(session(1), "pose", &small, now), "four longest messages are queued");
-        drop(opened.try_recv());
-        assert_eq!(
-            queues.bytes.load(Ordering::Relaxed),
-            (SOURCES_MAX - 1) * 97_000,
-            "a source that ends gives all back"
-        );
+        assert!(!queues.push(session(1), "pose", &small, now), "more than four longest messages are queued");
+        let sources: Vec<_> = std::iter::from_fn(|| opened.try_recv().ok()).take(SOURCES_MAX - 4).collect();
+        drop(sources);
+        assert_eq!(queues.bytes.load(Ordering::Relaxed), 4 * 97_000, "a source that ends gives its bytes back");
     }
 
     #[test]
-    fn a_new_source_replaces_the_longest_silent_one_and_none_that_sends() {
+    fn a_new_source_replaces_the_longest_silent_one_and_none_that_sends_or_waits() {
         let (mut queues, mut opened) = queues(1000);
         let start = Instant::now();
         let at = |tenths: u32| start + tenths * RECENT / 10;
@@ -230,10 +230,12 @@ mod tests {
             assert!(queues.push(session(source), "pose", &pose, at(source.into())));
         }
         assert!(!queues.push(session(99), "pose", &pose, at(11)), "source 1 has sent a second ago");
+        assert!(!queues.push(session(99), "pose", &pose, at(12)), "source 1 has a queued sample");
+        drop(opened.try_recv().unwrap());
         assert!(queues.push(session(99), "pose", &pose, at(12)));
         assert!(queues.all.iter().all(|queue| queue.source != session(1)) && queues.all.len() == SOURCES_MAX);
         let sources = std::iter::from_fn(|| opened.try_recv().ok()).count();
-        assert_eq!(sources, SOURCES_MAX + 1);
+        assert_eq!(sources, SOURCES_MAX);
         queues.end_silent(at(16) + SILENT_MAX);
         assert_eq!(queues.all.len(), 1, "all but source 16 were silent for more than ten minutes");
     }

@@ -1,7 +1,7 @@
 //! The observations of one zenoh session for one vehicle -> the vehicle's gateway, and reports back.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -69,8 +69,8 @@ pub(super) struct Common {
 pub(super) struct Source {
     id: Option<ZenohId>,
     samples: Receiver<QueuedSample>,
-    /// One count for each source of the vehicle.
-    sources: Weak<()>,
+    /// Number of sources of the vehicle.
+    sources: Arc<AtomicUsize>,
     share: TimeShare,
     clients: Clients,
     /// The observation that waits for the engine's time, and its bytes.
@@ -79,8 +79,13 @@ pub(super) struct Source {
 }
 
 impl Source {
-    /// A source whose samples come through this channel, until it is closed.
-    pub fn new(id: Option<ZenohId>, samples: Receiver<QueuedSample>, sources: Weak<()>, share: TimeShare) -> Self {
+    /// A source of the vehicle's `sources`, whose samples come through this channel until it is closed.
+    pub fn new(
+        id: Option<ZenohId>,
+        samples: Receiver<QueuedSample>,
+        sources: Arc<AtomicUsize>,
+        share: TimeShare,
+    ) -> Self {
         Self { id, samples, sources, share, clients: Clients::default(), waiting: None, waiting_bytes: None }
     }
 
@@ -122,10 +127,10 @@ impl Source {
         self.clients.all.into_iter().for_each(|mut client| common.gateway.end(&mut client.session));
     }
 
-    /// True if another sample may be decoded: all sources together have as many events and bytes in flight as one
-    /// stream over gRPC.
+    /// True if another sample may be decoded: each source has an equal part of the events and bytes that one stream
+    /// over gRPC may have in flight.
     fn has_credit(&self, gateway: &Gateway) -> bool {
-        let sources = self.sources.strong_count().max(1);
+        let sources = self.sources.load(Ordering::Relaxed).max(1);
         let (events_max, bytes_max) = (gateway.in_flight_max / sources, gateway.limits.message_bytes_max / sources);
         self.clients.have_credit(events_max, bytes_max)
     }
