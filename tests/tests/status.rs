@@ -2,7 +2,7 @@
 
 mod fixture;
 
-use std::io::{BufRead, Write};
+use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Stdio};
 
 use clearway::server::{Server, Setup};
@@ -253,4 +253,51 @@ async fn a_vehicle_in_error_does_not_cost_the_others_their_server() {
     .await;
     driving.halt();
     running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_configuration_that_is_refused_at_sighup_is_in_status_and_metrics_until_one_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("clearway.toml");
+    let mut config = config();
+    config.page.enabled = true;
+    std::fs::write(&file, config.to_toml()).unwrap();
+    let mut server = Command::new(clearway_tests::binaries().join("clearway"));
+    server.args(["serve", "--config"]).arg(&file).stdout(Stdio::null()).stderr(Stdio::piped());
+    let mut server = server.spawn().expect("clearway starts");
+    let (sender, mut log) = tokio::sync::mpsc::unbounded_channel();
+    let lines = BufReader::new(server.stderr.take().expect("piped")).lines().map_while(Result::ok);
+    let reading = std::thread::spawn(move || lines.for_each(|line| _ = sender.send(line)));
+    let mut line_with = async |text: &str| loop {
+        let line = within(text, log.recv()).await.unwrap_or_else(|| panic!("the log ends without {text:?}"));
+        if let Some((_, rest)) = line.split_once(text) {
+            return rest.to_owned();
+        }
+    };
+    let page = line_with("page http://").await.trim_end_matches('/').parse().expect("an address");
+    let reload = |toml: &str| {
+        std::fs::write(&file, toml).unwrap();
+        let sent = Command::new("sh").arg("-c").arg(format!("kill -HUP {}", server.id())).status().unwrap();
+        assert!(sent.success());
+    };
+    let is_successful = async |expected: u32| {
+        let metrics = ask(page, "/metrics").await.1;
+        assert!(metrics.contains(&format!("\nclearway_config_last_reload_successful{{}} {expected}\n")), "{metrics}");
+    };
+    let reasons = async || {
+        let text = ask(page, "/vehicles").await.1;
+        text.contains("was not read again at the newest SIGHUP") && text.contains("rolls")
+    };
+    is_successful(1).await;
+    reload(&format!("rolls = 3\n{}", config.to_toml()));
+    line_with("nothing is changed").await;
+    is_successful(0).await;
+    assert!(reasons().await);
+    reload(&config.to_toml());
+    line_with("are read again").await;
+    is_successful(1).await;
+    assert!(!reasons().await);
+    server.kill().unwrap();
+    server.wait().unwrap();
+    reading.join().unwrap();
 }

@@ -116,6 +116,13 @@ impl Running {
         Ok(())
     }
 
+    /// Notes in status and metrics why the configuration was not read again; `None`: it was.
+    pub fn note_reload(&self, refused: Option<String>) {
+        for status in self.vehicles.statuses() {
+            status.network.set_refused_reload(refused.clone());
+        }
+    }
+
     /// Resolves when the server stops.
     pub(super) fn stopped(&self) -> impl Future<Output = ()> + Send + use<> {
         let mut stopped = self.stop.subscribe();

@@ -290,6 +290,9 @@ impl Families<'_, '_> {
     fn write_process(&mut self, process: &process::Process) -> fmt::Result {
         let version = vec![(vec![("version", env!("CARGO_PKG_VERSION").to_owned())], 1.0)];
         self.family("clearway_build_info", "The program; the value is always 1.", version)?;
+        let is_reloaded = self.all.first().map(|of| f64::from(u8::from(of.status.network.is_reloaded())));
+        let help = "1 if the configuration was read again at the newest SIGHUP, or there was none; else 0.";
+        self.single("clearway_config_last_reload_successful", help, is_reloaded)?;
         let help = "Start of the process since the Unix epoch.";
         self.single("process_start_time_seconds", help, process.start_s)?;
         let help = "Memory of the process that is in use and not swapped out.";

@@ -1,5 +1,5 @@
-//! What a server knows of its network: listeners that hang, the router it has no session with, certificates that end,
-//! and what the link to the router takes for a map.
+//! What a server knows of its network: listeners that hang, the router it has no session with, certificates that end, a
+//! configuration that was not read again, and what the link to the router takes for a map.
 
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
@@ -44,6 +44,8 @@ pub struct Network {
     undelivered: Mutex<Option<Undelivered>>,
     /// What each certificate is, by its key in the configuration, and its end in seconds since the Unix epoch.
     certificates: Mutex<Vec<(&'static str, i64)>>,
+    /// Why the configuration was not read again at the newest SIGHUP; `None` if it was, or there was none.
+    refused_reload: Mutex<Option<String>>,
     /// Time that the link to the router took for the newest map that is known of, and when that was known.
     link: Mutex<Option<(Instant, Duration)>>,
 }
@@ -79,6 +81,16 @@ impl Network {
         ends.clone_into(&mut locked(&self.certificates));
     }
 
+    /// Notes why the configuration was not read again; `None`: it was.
+    pub fn set_refused_reload(&self, reason: Option<String>) {
+        *locked(&self.refused_reload) = reason;
+    }
+
+    /// True if the configuration was read again at the newest SIGHUP, or there was none.
+    pub fn is_reloaded(&self) -> bool {
+        locked(&self.refused_reload).is_none()
+    }
+
     /// Notes how long the link to the router took for a map, from when it was sent until it was transmitted; or how
     /// long it has taken until now.
     pub fn note_link(&self, now: Instant, took: Duration) {
@@ -97,8 +109,16 @@ impl Network {
         let of_certificate = |(name, end_s): &(&'static str, i64)| end_text(name, *end_s, now_ns / 1_000_000_000);
         let ends: Vec<_> = locked(&self.certificates).iter().filter_map(of_certificate).collect();
         let undelivered = locked(&self.undelivered).as_ref().map(|undelivered| undelivered_text(undelivered, now));
-        away.into_iter().chain(undelivered).chain(ends).collect()
+        let refused_reload = locked(&self.refused_reload).as_deref().map(reload_text);
+        away.into_iter().chain(undelivered).chain(ends).chain(refused_reload).collect()
     }
+}
+
+fn reload_text(reason: &str) -> String {
+    format!(
+        "the configuration was not read again at the newest SIGHUP: {reason}; certificates, tokens, roles and limits \
+         are those of before"
+    )
 }
 
 fn undelivered_text(Undelivered { since, endpoints, key }: &Undelivered, now: Instant) -> String {
@@ -177,6 +197,18 @@ mod tests {
         let ended = "the certificate of grpc.tls.certificate ended 3 h ago: clients refuse it; write a new one there, \
                      then SIGHUP";
         assert_eq!(at(100 * day + 3 * 3600), ended);
+    }
+
+    #[test]
+    fn a_refused_reload_is_named_until_one_is_accepted() {
+        let (network, now) = (Network::default(), Instant::now());
+        assert!(network.is_reloaded());
+        network.set_refused_reload(Some("unknown field `rolls`".to_owned()));
+        let text = "the configuration was not read again at the newest SIGHUP: unknown field `rolls`; certificates, \
+                    tokens, roles and limits are those of before";
+        assert_eq!((network.problems(now, 0), network.is_reloaded()), (vec![text.to_owned()], false));
+        network.set_refused_reload(None);
+        assert_eq!((network.problems(now, 0), network.is_reloaded()), (vec![], true));
     }
 
     #[test]

@@ -40,13 +40,14 @@ pub const OBSERVATION_REASONS: [&str; 14] = [
     "stamp_ahead",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.
-pub const CLOSE_REASONS: [&str; 13] = [
+pub const CLOSE_REASONS: [&str; 14] = [
     "accept_error",
     "calls",
     "denied",
     "flood",
     "handshake",
     "handshake_timeout",
+    "http2",
     "idle",
     "made_room",
     "no_request",

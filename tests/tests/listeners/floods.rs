@@ -52,6 +52,27 @@ async fn frames_without_data_end_their_connection_and_no_other() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn what_http2_itself_ends_is_counted() {
+    let running = start(everything()).await;
+    let address = running.grpc.unwrap();
+    let attack = async |bytes: Vec<u8>| {
+        let mut attacker = TcpStream::connect(address).await.unwrap();
+        attacker.write_all(&http2::opening(65_535)).await.unwrap();
+        flood(attacker, &bytes).await;
+    };
+    // A head that never ends.
+    let open_head = frame(1, 0, 1, &[0x82]);
+    let more = frame(9, 0, 1, &[]);
+    attack([open_head, more.repeat(900)].concat()).await;
+    assert_eq!(floods(&running, "grpc").await, 1.0);
+    // DATA of a stream that no client may open.
+    attack(frame(0, 0, 2, b"x")).await;
+    let mistakes = "clearway_connections_closed_total{listener=\"grpc\",reason=\"http2\"}";
+    assert_eq!(metric(&running, mistakes).await, 1.0);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_client_that_answers_each_piece_of_a_response_with_three_frames_is_served() {
     let running = start(everything()).await;
     let mut stream = TcpStream::connect(running.grpc.unwrap()).await.unwrap();

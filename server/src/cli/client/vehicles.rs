@@ -10,7 +10,7 @@ use crate::cli::client::fleet::{is_of_several_servers, server_text};
 use crate::cli::shared::output::{block_on, counted, print_line};
 use crate::status::vehicle_json;
 
-/// List the vehicles of a server and of those it knows: maps, sensors, refused and lost datagrams, readers, recording.
+/// List the vehicles of a server and of those it knows: maps, sensors, losses, readers, recording.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway vehicles

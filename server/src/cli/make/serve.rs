@@ -54,9 +54,13 @@ async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) 
         tokio::select! {
             () = &mut stop => break,
             () = service_manager::report_life(&running) => {}
-            _ = hangups.recv() => match reload(&running, configuration, &config) {
-                Ok(()) => tracing::info!("certificates, tokens, roles and limits are read again"),
-                Err(error) => tracing::error!("nothing is changed: {error:#}"),
+            _ = hangups.recv() => {
+                let reloaded = reload(&running, configuration, &config);
+                running.note_reload(reloaded.as_ref().err().map(|error| format!("{error:#}")));
+                match reloaded {
+                    Ok(()) => tracing::info!("certificates, tokens, roles and limits are read again"),
+                    Err(error) => tracing::error!("nothing is changed: {error:#}"),
+                }
             }
         }
     }

@@ -28,6 +28,7 @@ mod web;
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
+use std::error::Error;
 use std::future::poll_fn;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -222,7 +223,7 @@ impl Shared {
         let Some((transport, names)) = self.secure(stream, &place).await else { return };
         let is_http2 = self.protocol == Protocol::Grpc;
         let io = TokioIo::new(Connection::new(transport, place.clone(), is_http2));
-        let (protocol, names) = (self.protocol, Arc::new(names));
+        let (protocol, names, of) = (self.protocol, Arc::new(names), place.clone());
         let service =
             service_fn(move |request| self.clone().answer(request, place.clone(), names.clone(), router.clone()));
         // An error ends this connection alone, and the peer knows it better.
@@ -230,11 +231,16 @@ impl Shared {
             Protocol::Grpc => {
                 let connection = http2().serve_connection(io, service);
                 tokio::pin!(connection);
-                tokio::select! {
-                    _ = connection.as_mut() => return,
-                    () = stopping.cancelled() => connection.as_mut().graceful_shutdown(),
+                let ended = tokio::select! {
+                    ended = connection.as_mut() => ended,
+                    () = stopping.cancelled() => {
+                        connection.as_mut().graceful_shutdown();
+                        connection.await
+                    }
+                };
+                if let Some(reason) = ended.err().as_ref().and_then(breach) {
+                    of.close_for_breach(reason);
                 }
-                let _ = connection.await;
             }
             Protocol::Web(_) => {
                 let connection = http1().serve_connection(io, service).with_upgrades();
@@ -364,6 +370,12 @@ impl Shared {
             Protocol::Web(_) => (code, format!("{}\n", status.message())).into_response(),
         }
     }
+}
+
+/// Why the library has ended a connection of HTTP/2, if the client breached the protocol or the library's limits.
+fn breach(error: &hyper::Error) -> Option<h2::Reason> {
+    let of_library = error.source().and_then(|source| source.downcast_ref::<h2::Error>());
+    of_library.filter(|error| error.is_library()).and_then(h2::Error::reason)
 }
 
 fn http2() -> http2::Builder<TokioExecutor> {

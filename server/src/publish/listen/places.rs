@@ -395,6 +395,13 @@ impl Place {
         self.occupant.closing.cancel();
     }
 
+    /// Counts and logs that HTTP/2 has ended the connection because of what the client sent.
+    pub fn close_for_breach(&self, of: h2::Reason) {
+        let reason = if of == h2::Reason::ENHANCE_YOUR_CALM { "flood" } else { "http2" };
+        tracing::info!(peer = %self.peer(), reason, of = of.description(), "connection closed");
+        self.count(reason);
+    }
+
     /// Records that the transport was given a piece of a response.
     pub fn add_piece(&self) {
         self.occupant.pieces.fetch_add(1, Ordering::Relaxed);
