@@ -87,7 +87,7 @@ fn scan(stamp_ns: i64, arrival_ns: i64) -> Event {
     let mut scan = Scan { stamp_ns, ..Scan::default() };
     for i in 0..3600 {
         let (sin, cos) = (i as f32 * 0.01).sin_cos();
-        let range_m = 4.0 + (i % 16) as f32;
+        let range_m = 8.0 + (i % 16) as f32;
         scan.x.push(range_m * cos);
         scan.y.push(range_m * sin);
         scan.z.push(-1.9);
