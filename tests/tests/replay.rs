@@ -104,6 +104,17 @@ async fn a_nuscenes_scan_faces_forward_and_its_own_rings_make_the_rows() {
     assert_eq!(modelled.to_json()["sensors"][0]["elevations"], "model");
 }
 
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn scans_of_another_model_than_the_given_one_are_no_success_and_the_model_is_named() {
+    let folder = drive("kitti/patchwork-plusplus");
+    let arguments = ["replay", ".", "--model", "vlp16", "--extrinsics", "0,0,1.73,0,0,0"];
+    let output = clearway_tests::run(&folder, "clearway", &arguments);
+    let said = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+    assert!(output.status.code() == Some(2) && said.contains("the configured model vlp16"), "{said}");
+    assert!(said.contains("3 for scan_model") && said.contains("has 16 lasers"), "{said}");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_bin_file_that_is_no_scan_is_refused_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();

@@ -199,6 +199,7 @@ impl Engine {
             Ok(false) => {}
             Err(error) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
+                self.status.note_refusal(error);
             }
         }
         if let Some(recording) = &mut self.recording {

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 use clearway_mapping::config::BodyConfig;
+use clearway_mapping::error::EventError;
 use clearway_mapping::ledger::Ledger;
 use clearway_mapping::pipeline::NamedStatus;
 use clearway_proto::v1;
@@ -90,6 +91,7 @@ pub struct VehicleStatus {
 #[derive(Debug, Default)]
 pub(super) struct Changing {
     ledger: Ledger,
+    refusals: BTreeMap<&'static str, String>,
     pub(super) sensors: Vec<NamedStatus>,
     /// When something of each sensor arrived and could be read, by name.
     pub(super) seen: BTreeMap<String, Seen>,
@@ -151,6 +153,8 @@ pub(crate) struct MadeMap<'a> {
 pub struct Snapshot {
     /// Counts of everything that arrived: the core's ledger, and readings dropped before the event queue.
     pub ledger: Ledger,
+    /// The first refusal of an event for each reason, in words.
+    pub refusals: BTreeMap<&'static str, String>,
     /// The sensors with their status and counts.
     pub sensors: Vec<NamedStatus>,
     /// Invalid messages since the start of the server, by reason; the ledger counts them as `observation`.
@@ -371,6 +375,11 @@ impl VehicleStatus {
         (state.sensors, state.pose) = (sensors, pose);
     }
 
+    /// Keeps the words of a refusal, if it is the first for its reason.
+    pub(crate) fn note_refusal(&self, error: &EventError) {
+        locked(&self.changing).refusals.entry(error.reason()).or_insert_with(|| error.to_string());
+    }
+
     /// Records a new map and the time it took.
     pub(crate) fn mapped(&self, made: MadeMap<'_>) {
         let MadeMap { encoded: map, states, stages, validity, speed_m_s, is_shifted } = made;
@@ -410,6 +419,7 @@ impl VehicleStatus {
         let now = self.started.elapsed();
         let mut snapshot = Snapshot {
             ledger: state.ledger.clone(),
+            refusals: state.refusals.clone(),
             sensors: state.sensors.clone(),
             maps: state.maps,
             newest_capture_end_ns: state.newest_capture_end_ns,

@@ -24,6 +24,10 @@ const STRIDE: usize = 17;
 /// field of view.
 const POINTS_MIN: usize = 1000;
 
+/// Least horizontal range of a point that is judged. Ours: the lasers do not leave the sensor at its origin, which turns
+/// near points, mostly those on the vehicle itself, by degrees.
+const RANGE_M_MIN: f32 = 2.0;
+
 /// Checks that a scan has no ring that the model lacks and that its points lie where lasers of the model point.
 ///
 /// # Errors
@@ -43,8 +47,9 @@ pub(super) fn check(scan: &Scan, model: Model) -> Result<(), EventError> {
     for i in (0..scan.x.len()).step_by(STRIDE) {
         let (range_m, z_m) = ((scan.x[i] * scan.x[i] + scan.y[i] * scan.y[i]).sqrt(), scan.z[i]);
         // Comparisons with NaN are false.
-        points += usize::from(range_m > 0.0);
-        outside += usize::from(z_m < low * range_m || z_m > high * range_m);
+        let is_judged = range_m >= RANGE_M_MIN;
+        points += usize::from(is_judged);
+        outside += usize::from(is_judged && (z_m < low * range_m || z_m > high * range_m));
     }
     if outside * 100 > points * OUTSIDE_PERCENT_MAX {
         let outside_percent = (outside * 100 / points.max(1)).clamp(OUTSIDE_PERCENT_MAX + 1, 100);

@@ -142,7 +142,8 @@ async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Resul
     } else {
         print(&summary.to_text())?
     };
-    let has_no_map = summary.reached_end && summary.maps() == 0 && (serve || summary.received() == 0);
+    let is_expected = serve || summary.received() == 0 || summary.is_all_refused();
+    let has_no_map = summary.reached_end && summary.maps() == 0 && is_expected;
     if has_no_map {
         eprintln!("clearway: the {what} made no map: {}", why_no_map(&summary.mount, &summary.snapshot));
     }

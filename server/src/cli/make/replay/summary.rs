@@ -64,8 +64,12 @@ pub fn why_no_map(mount: &Mount, snapshot: &Snapshot) -> String {
         return format!("the mount of the sensor is not known: {why}");
     }
     let ledger = &snapshot.ledger;
-    let refused = ledger.refused.iter().map(|(reason, n)| format!("{n} for {reason}")).collect::<Vec<_>>();
-    let refused = if refused.is_empty() { String::new() } else { format!(" ({})", refused.join(", ")) };
+    let refused = ledger.refused.iter().map(|(reason, n)| match snapshot.refusals.get(reason) {
+        Some(first) => format!("{n} for {reason}: {first}"),
+        None => format!("{n} for {reason}"),
+    });
+    let refused = refused.collect::<Vec<_>>();
+    let refused = if refused.is_empty() { String::new() } else { format!(" ({})", refused.join("; ")) };
     format!(
         "of {} received {} were decoded and {}{refused} refused; they hold {}",
         ledger.received,
@@ -142,6 +146,13 @@ impl Summary {
         }
     }
 
+    /// True if something was received, and all of it was refused.
+    pub fn is_all_refused(&self) -> bool {
+        let others = self.others.iter().map(|(_, snapshot)| snapshot);
+        let mut ledgers = std::iter::once(&self.snapshot).chain(others).map(|snapshot| &snapshot.ledger);
+        self.received() > 0 && ledgers.all(|ledger| ledger.received == ledger.refused.values().sum::<u64>())
+    }
+
     /// The summary as a few lines of text.
     pub fn to_text(&self) -> String {
         let is_several = !self.others.is_empty();
@@ -178,7 +189,10 @@ fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
         snapshot.refused(),
         ledger.lost
     )];
-    lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
+    lines.extend(ledger.refused.iter().map(|(reason, n)| {
+        let first = snapshot.refusals.get(reason).map_or(String::new(), |first| format!("; the first: {first}"));
+        format!("  refused for {reason}: {n}{first}")
+    }));
     let several = snapshot.sensors.len() > 1;
     for sensor in &snapshot.sensors {
         let model = sensor.status.model.map_or("unknown model", clearway_lidar::model::Model::as_str);
@@ -215,6 +229,7 @@ fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
     });
     let document = json!({
         "packets": snapshot.packets_json(),
+        "refusals": snapshot.refusals,
         "telemetry": ledger.telemetry,
         "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
         "revolutions": snapshot.revolutions(),
