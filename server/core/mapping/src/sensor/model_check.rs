@@ -24,8 +24,8 @@ const STRIDE: usize = 17;
 /// field of view.
 const POINTS_MIN: usize = 1000;
 
-/// Least horizontal range of a point that is judged. Ours: the lasers do not leave the sensor at its origin, which turns
-/// near points, mostly those on the vehicle itself, by degrees.
+/// Least horizontal range of a point that is judged. Ours: the lasers do not leave the sensor at its origin, which
+/// turns near points, mostly those on the vehicle itself, by degrees.
 const RANGE_M_MIN: f32 = 2.0;
 
 /// Checks that a scan has no ring that the model lacks and that its points lie where lasers of the model point.
