@@ -15,9 +15,10 @@ use crate::publish::listen::Budget;
 const LIMITS: [(&str, &str); 12] = [
     // A thousand readers, and the vehicles.
     ("transport/unicast/max_sessions", "1024"),
-    // Handshakes at a time; a peer that opens a connection and stays silent loses it after 5 s.
-    ("transport/unicast/accept_pending", "100"),
-    ("transport/unicast/accept_timeout", "5000"),
+    // Handshakes at a time; a peer that opens a connection and stays silent loses it after 3 s. zenoh has no limit for
+    // one address, so there are many places.
+    ("transport/unicast/accept_pending", "1000"),
+    ("transport/unicast/accept_timeout", "3000"),
     // A peer behind a repaired link, or a restarted router, has the maps again within 2 s: the kernel repeats the first
     // packet of a connection after 1 s and then only after 3 s, so that a new attempt is sooner.
     ("transport/unicast/open_timeout", "2000"),

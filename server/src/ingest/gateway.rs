@@ -173,7 +173,7 @@ impl Gateway {
     }
 
     /// Returns `bodies` if a map of their scan, together with the newest scans of the other sensors, does not take too
-    /// long.
+    /// long, or if it would not with as many points of each of them: the scans of others do not make one too large.
     fn check_time(&self, bodies: Bodies, source: u16, now_ns: i64) -> Result<Bodies, ObservationError> {
         let Some(scan) =
             bodies.iter().find_map(|(_, body)| if let Body::Scan(scan) = body { Some(scan) } else { None })
@@ -184,8 +184,9 @@ impl Gateway {
         let newest = &mut locked(&self.sensors).newest_scans;
         newest.retain(|of, (_, came_ns)| *of != source && now_ns.saturating_sub(*came_ns) < SCAN_AGE_NS_MAX);
         let others = newest.values().map(|(points, _)| points).sum();
-        let all = points.saturating_add(others);
-        if !self.map_time.allows(all, self.map_time_max, now_ns) {
+        let (all, equal) = (points.saturating_add(others), points.saturating_mul(newest.len() + 1));
+        let is_small = self.map_time.of(equal) <= self.map_time_max;
+        if !is_small && !self.map_time.allows(all, self.map_time_max, now_ns) {
             let takes = self.map_time.of(all);
             return Err(ObservationError::Time { points, others, takes, takes_max: self.map_time_max });
         }
@@ -419,7 +420,8 @@ mod tests {
         let refused = push(3, "rear", 100_000).remove(0);
         assert!(refused.message.contains("100000 points, beside 100000 of other sensors"), "{}", refused.message);
         assert!(push(4, "rear", 70_000).is_empty() && push(5, "top", 110_000).is_empty());
+        assert!(push(6, "rear", 90_000).is_empty(), "an equal part of the time is never too much");
         let scans = events.try_iter().filter(|queued| matches!(queued.event.body, Body::Scan(_)));
-        assert_eq!(scans.count(), 3, "beside the reports of what was refused");
+        assert_eq!(scans.count(), 4, "beside the reports of what was refused");
     }
 }

@@ -12,7 +12,7 @@
 //! control refuses the others first; this check also holds if it is configured otherwise. Without roles a sender may
 //! name any session, also that of another sender.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -36,7 +36,8 @@ const SAMPLES_MAX: usize = 256;
 /// Greatest number of sources of one vehicle. A new source replaces the one that was silent longest, of those without
 /// queued samples. Ours: the sensors of a vehicle seldom have more than one session each.
 const SOURCES_MAX: usize = 16;
-/// A source that has sent within this time is not replaced. Ours: ten revolutions.
+/// A source that has sent within this time is not replaced, if an observation of it was ever accepted. Ours: ten
+/// revolutions.
 const RECENT: Duration = Duration::from_secs(1);
 /// Period at which sources that were silent too long are ended.
 const END_PERIOD: Duration = Duration::from_secs(1);
@@ -122,6 +123,8 @@ struct Queue {
     bytes: Arc<AtomicUsize>,
     /// When its newest sample came.
     heard: Instant,
+    /// True if an observation of it was accepted.
+    is_accepted: Arc<AtomicBool>,
 }
 
 impl Queues {
@@ -131,39 +134,47 @@ impl Queues {
     }
 
     /// Queues a sample. False if it exceeds a bound: a source with queued samples gets another one only while they have
-    /// at most half the bytes of the vehicle's longest message, and those of all sources at most four times its bytes.
+    /// at most half the bytes of the vehicle's longest message, and a sixteenth of them if the samples of all sources
+    /// have more than four times its bytes. Of a sample that is too long only the length is queued.
     fn push(&mut self, source: Option<ZenohId>, key: &str, payload: &ZBytes, now: Instant) -> bool {
         let bytes_max = self.gateway.limits.message_bytes_max;
         let of_vehicle = self.bytes.clone();
         let Some(queue) = self.get_or_open(source, now) else { return false };
         queue.heard = now;
         let [before, all] = [&queue.bytes, &of_vehicle].map(|count| count.load(Ordering::Relaxed));
-        if before != 0 && (before > bytes_max / 2 || all > 4 * bytes_max) {
+        let part = if all > 4 * bytes_max { bytes_max / SOURCES_MAX } else { bytes_max / 2 };
+        if before > part {
             return false;
         }
+        let length = payload.len();
+        let payload = if length > bytes_max { ZBytes::new() } else { payload.clone() };
         let queued = QueuedBytes::new(payload.len(), [queue.bytes.clone(), of_vehicle]);
-        queue.samples.try_send(QueuedSample { key: key.to_owned(), payload: payload.clone(), queued }).is_ok()
+        queue.samples.try_send(QueuedSample { key: key.to_owned(), payload, length, queued }).is_ok()
     }
 
-    /// The queue of this source; `None` if it is new and every other has sent recently or has queued samples.
+    /// The queue of this source; `None` if it is new and no other may end for it.
     fn get_or_open(&mut self, source: Option<ZenohId>, now: Instant) -> Option<&mut Queue> {
         if let Some(at) = self.all.iter().position(|queue| queue.source == source) {
             return self.all.get_mut(at);
         }
         if self.all.len() >= SOURCES_MAX {
             let may_end = |(_, queue): &(usize, &Queue)| {
-                now.saturating_duration_since(queue.heard) > RECENT && queue.bytes.load(Ordering::Relaxed) == 0
+                let is_recent = now.saturating_duration_since(queue.heard) <= RECENT;
+                let holds = is_recent && queue.is_accepted.load(Ordering::Relaxed);
+                !holds && queue.bytes.load(Ordering::Relaxed) == 0
             };
             let ending = self.all.iter().enumerate().filter(may_end);
             let (longest, _) = ending.min_by_key(|(_, queue)| queue.heard)?;
             self.all.remove(longest);
         }
         let (samples, receiver) = channel(SAMPLES_MAX);
-        let opened = Source::new(source, receiver, self.count.clone(), self.gateway.time.share());
+        let is_accepted = Arc::<AtomicBool>::default();
+        let share = self.gateway.time.share();
+        let opened = Source::new(source, receiver, self.count.clone(), is_accepted.clone(), share);
         // An error means that the server stops.
         self.opened.send(opened).ok()?;
         self.count.store(self.all.len() + 1, Ordering::Relaxed);
-        Some(self.all.push_mut(Queue { source, samples, bytes: Arc::default(), heard: now }))
+        Some(self.all.push_mut(Queue { source, samples, bytes: Arc::default(), heard: now, is_accepted }))
     }
 
     /// Ends the sources that were silent for [`SILENT_MAX`].
@@ -209,15 +220,19 @@ mod tests {
         let (mut queues, mut opened) = queues(1000);
         let now = Instant::now();
         let large = ZBytes::from(vec![0; 97_000]);
-        let small = ZBytes::from(vec![0; 10]);
-        assert!(queues.push(session(1), "pose", &small, now));
-        for source in 2..=SOURCES_MAX as u8 {
+        let small = ZBytes::from(vec![0; 1000]);
+        for source in 1..SOURCES_MAX as u8 {
             assert!(queues.push(session(source), "scan/top", &large, now), "source {source}");
         }
         assert!(!queues.push(session(1), "pose", &small, now), "more than four longest messages are queued");
-        let sources: Vec<_> = std::iter::from_fn(|| opened.try_recv().ok()).take(SOURCES_MAX - 4).collect();
-        drop(sources);
+        let last = (0..100).filter(|_| queues.push(session(16), "pose", &small, now)).count();
+        assert_eq!(last, 7, "a sixteenth of a longest message is free for each source, and one sample");
+        let too_long = ZBytes::from(vec![0; 1 << 20]);
+        let mut sources: Vec<_> = std::iter::from_fn(|| opened.try_recv().ok()).collect();
+        drop(sources.split_off(4));
+        assert!(queues.push(session(17), "scan/top", &too_long, now), "its client learns what is allowed");
         assert_eq!(queues.bytes.load(Ordering::Relaxed), 4 * 97_000, "a source that ends gives its bytes back");
+        drop(sources);
     }
 
     #[test]
@@ -228,14 +243,20 @@ mod tests {
         let pose = ZBytes::from(vec![0; 10]);
         for source in 1..=SOURCES_MAX as u8 {
             assert!(queues.push(session(source), "pose", &pose, at(source.into())));
+            queues.all.last().unwrap().is_accepted.store(true, Ordering::Relaxed);
         }
         assert!(!queues.push(session(99), "pose", &pose, at(11)), "source 1 has sent a second ago");
         assert!(!queues.push(session(99), "pose", &pose, at(12)), "source 1 has a queued sample");
         drop(opened.try_recv().unwrap());
         assert!(queues.push(session(99), "pose", &pose, at(12)));
         assert!(queues.all.iter().all(|queue| queue.source != session(1)) && queues.all.len() == SOURCES_MAX);
-        let sources = std::iter::from_fn(|| opened.try_recv().ok()).count();
-        assert_eq!(sources, SOURCES_MAX);
+        let mut sources: Vec<_> = std::iter::from_fn(|| opened.try_recv().ok()).collect();
+        assert_eq!(sources.len(), SOURCES_MAX);
+        assert!(!queues.push(session(98), "pose", &pose, at(12)), "source 99 has a queued sample");
+        drop(sources.pop());
+        assert!(queues.push(session(98), "pose", &pose, at(12)), "nothing of source 99 was accepted");
+        assert!(queues.all.iter().all(|queue| queue.source != session(99)));
+        queues.all.last_mut().unwrap().heard = at(0);
         queues.end_silent(at(16) + SILENT_MAX);
         assert_eq!(queues.all.len(), 1, "all but source 16 were silent for more than ten minutes");
     }

@@ -1,7 +1,7 @@
 //! The observations of one zenoh session for one vehicle -> the vehicle's gateway, and reports back.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -33,7 +33,10 @@ pub(super) const SILENT_MAX: Duration = Duration::from_secs(600);
 pub(super) struct QueuedSample {
     /// The key after `clearway/<vehicle>/ingest/`.
     pub key: String,
+    /// Empty if it is too long.
     pub payload: ZBytes,
+    /// Length of the payload as it came.
+    pub length: usize,
     pub queued: QueuedBytes,
 }
 
@@ -71,6 +74,8 @@ pub(super) struct Source {
     samples: Receiver<QueuedSample>,
     /// Number of sources of the vehicle.
     sources: Arc<AtomicUsize>,
+    /// True if an observation was accepted.
+    is_accepted: Arc<AtomicBool>,
     share: TimeShare,
     clients: Clients,
     /// The observation that waits for the engine's time, and its bytes.
@@ -84,9 +89,11 @@ impl Source {
         id: Option<ZenohId>,
         samples: Receiver<QueuedSample>,
         sources: Arc<AtomicUsize>,
+        is_accepted: Arc<AtomicBool>,
         share: TimeShare,
     ) -> Self {
-        Self { id, samples, sources, share, clients: Clients::default(), waiting: None, waiting_bytes: None }
+        let (clients, waiting, waiting_bytes) = (Clients::default(), None, None);
+        Self { id, samples, sources, is_accepted, share, clients, waiting, waiting_bytes }
     }
 
     /// Decodes the samples and sends reports, until the channel is closed and everything is reported.
@@ -100,9 +107,9 @@ impl Source {
                 // Outcomes first, because they give credit.
                 biased;
                 Some((id, outcome)) = outcomes.recv() => {
-                    self.clients.record_outcome(id, outcome);
+                    self.record_outcome(id, outcome);
                     while let Ok((id, outcome)) = outcomes.try_recv() {
-                        self.clients.record_outcome(id, outcome);
+                        self.record_outcome(id, outcome);
                     }
                 }
                 time = Waiting::time(&mut self.waiting), if self.waiting.is_some() => {
@@ -127,6 +134,13 @@ impl Source {
         self.clients.all.into_iter().for_each(|mut client| common.gateway.end(&mut client.session));
     }
 
+    fn record_outcome(&mut self, id: ObservationId, outcome: Outcome) {
+        if outcome == Outcome::Accepted {
+            self.is_accepted.store(true, Ordering::Relaxed);
+        }
+        self.clients.record_outcome(id, outcome);
+    }
+
     /// True if another sample may be decoded: each source has an equal part of the events and bytes that one stream
     /// over gRPC may have in flight.
     fn has_credit(&self, gateway: &Gateway) -> bool {
@@ -137,10 +151,10 @@ impl Source {
 
     /// Decodes a sample; the observation waits for the engine's time, or is refused.
     async fn decode(&mut self, sample: QueuedSample, common: &Common) {
-        let QueuedSample { key, payload, queued } = sample;
+        let QueuedSample { key, payload, length, queued } = sample;
         let gateway = &common.gateway;
         let bytes = Bytes::from(payload.to_bytes().into_owned());
-        let (length, bytes_max) = (bytes.len(), gateway.limits.message_bytes_max);
+        let bytes_max = gateway.limits.message_bytes_max;
         let decoded = match length <= bytes_max {
             false => Err(ObservationError::Length { bytes: length, bytes_max }),
             true => v1::Observation::decode(bytes)

@@ -135,7 +135,7 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
     }
     let printed = follow(folder.path(), &script);
     assert!(printed.lines().any(|line| line.ends_with(" False")), "a fresh map: {printed}");
-    let listed = |name: &str| printed.lines().any(|line| line.starts_with(&format!("{name}: ")));
+    let listed = |name: &str| printed.lines().any(|line| line.starts_with(&format!("{name} on ")));
     assert!(listed("car") && listed("van"), "any server lists all vehicles: {printed}");
 }
 

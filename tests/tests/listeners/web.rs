@@ -35,6 +35,10 @@ async fn only_get_and_head_from_the_page_itself_are_answered() {
             }
         }
     }
+    for twice in ["Host: evil.example", "Origin: http://localhost\r\nOrigin: http://evil.example", "Origin: \u{e9}"] {
+        let answer = ask(running.page.unwrap(), &format!("{}{twice}\r\n", get("/healthz"))).await;
+        assert!(answer.starts_with("HTTP/1.1 400") && answer.contains("one value of ASCII"), "{twice}: {answer}");
+    }
     let head = ask(running.page.unwrap(), &get("/").replace("GET", "HEAD")).await;
     assert!(head.starts_with("HTTP/1.1 200") && head.ends_with("\r\n\r\n"), "{head}");
 

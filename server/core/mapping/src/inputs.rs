@@ -133,7 +133,9 @@ impl Inputs {
 
     /// Index of the reference sensor by the configuration alone, if it names none.
     pub fn reference_by_configuration(&self) -> usize {
-        let lasers: Vec<usize> = self.sensors.iter().map(SensorPipeline::lasers_configured).collect();
+        // Without a configured sensor the first declared one is it.
+        let candidates = if self.configured > 0 { self.configured } else { self.sensors.len() };
+        let lasers: Vec<usize> = self.sensors[..candidates].iter().map(SensorPipeline::lasers_configured).collect();
         ReferenceChoice::by_configuration(&self.scans, &lasers)
     }
 

@@ -105,7 +105,11 @@ impl Pipeline {
         let reference_sensor = if is_named { configured } else { inputs.reference_by_configuration() };
         inputs.set_reference_sensor(reference_sensor);
         Ok(Self {
-            reference: ReferenceChoice::new(is_named || config.sensors.len() == 1, config.fusion.deadline_ns()),
+            reference: ReferenceChoice::new(
+                is_named || config.sensors.len() == 1,
+                config.sensors.len(),
+                config.fusion.deadline_ns(),
+            ),
             maps: config.maps.clone(),
             deadline_ns: config.fusion.deadline_ns(),
             has_epochs: config.time.ahead_ms_max > 0,

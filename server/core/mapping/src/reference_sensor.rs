@@ -3,7 +3,9 @@
 //! In: the sensors of the configuration, then their first scans. Out: the index of the reference sensor. Its scans make
 //! the maps and its lasers define the rows of radial maps, so it should stand upright, see all around the vehicle and
 //! have many lasers. Until every sensor has completed a scan, or the deadline has passed since the first scan, the
-//! configuration alone decides; then the scans decide, once. Events alone decide, so a replay chooses the same sensor.
+//! configuration alone decides; then the scans decide, once. A sensor that a stream has declared is chosen only while no
+//! configured one has completed a scan, because it may be withdrawn at any time. Events alone decide, so a replay
+//! chooses the same sensor.
 
 use crate::event_time::EventTime;
 use crate::sensor::scan::SensorScan;
@@ -34,30 +36,28 @@ struct Merits {
 #[derive(Clone)]
 pub(crate) struct ReferenceChoice {
     is_decided: bool,
+    /// Number of sensors of the configuration; those after them are declared.
+    configured: usize,
     deadline_ns: i64,
     /// Event time of the first completed scan, ns.
     first_ns: Option<i64>,
     /// For each sensor, true if it has completed a whole scan.
     is_known: Vec<bool>,
-    /// Number of sensors with a whole scan when the scans decided last.
-    decided_by: Option<usize>,
+    /// When the scans decided last: number of sensors among which they did, and of those with a whole scan.
+    decided_by: Option<(usize, usize)>,
 }
 
 impl ReferenceChoice {
-    /// A choice before the first event; it is made already if the configuration names the sensor or has only one.
-    pub fn new(is_decided: bool, deadline_ns: i64) -> Self {
-        Self { is_decided, deadline_ns, first_ns: None, is_known: Vec::new(), decided_by: None }
+    /// A choice before the first event among this number of configured sensors; it is made already if the configuration
+    /// names the sensor or has only one.
+    pub fn new(is_decided: bool, configured: usize, deadline_ns: i64) -> Self {
+        Self { is_decided, configured, deadline_ns, first_ns: None, is_known: Vec::new(), decided_by: None }
     }
 
-    /// The reference sensor by the configuration alone: `lasers_configured` has the number of lasers of each sensor
-    /// whose elevations are configured, else 0.
+    /// The reference sensor by the configuration alone: `lasers_configured` has the number of lasers of each configured
+    /// sensor whose elevations are configured, else 0.
     pub fn by_configuration(scans: &[SensorScan], lasers_configured: &[usize]) -> usize {
-        let merits = |(scan, lasers): (&SensorScan, &usize)| Merits {
-            sees_all_around: false,
-            sectors: 0,
-            ..merits(scan, *lasers)
-        };
-        best(scans.iter().zip(lasers_configured).map(merits))
+        best(scans.iter().zip(lasers_configured).map(|(scan, lasers)| merits(scan, *lasers, 0)))
     }
 
     /// Forgets a sensor that is withdrawn. If it was the reference sensor, the scans decide again.
@@ -78,14 +78,17 @@ impl ReferenceChoice {
         for (is_known, scan) in self.is_known.iter_mut().zip(scans) {
             *is_known |= scan.completed > 0 && scan.state.partial.is_empty();
         }
-        let known = self.is_known.iter().filter(|is_known| **is_known).count();
-        self.is_decided = known == scans.iter().filter(|scan| !scan.is_withdrawn()).count();
-        if !self.is_decided && (since_ns <= self.deadline_ns || self.decided_by == Some(known)) {
+        let has_configured = self.is_known.iter().take(self.configured).any(|is_known| *is_known);
+        let candidates = if has_configured { self.configured } else { scans.len() };
+        let (scans, is_known) = (&scans[..candidates], &self.is_known[..candidates]);
+        let decided_by = Some((candidates, is_known.iter().filter(|is_known| **is_known).count()));
+        self.is_decided = decided_by == Some((candidates, scans.iter().filter(|scan| !scan.is_withdrawn()).count()));
+        if !self.is_decided && (since_ns <= self.deadline_ns || self.decided_by == decided_by) {
             return None;
         }
-        self.decided_by = Some(known);
+        self.decided_by = decided_by;
         let lasers = |scan: &SensorScan| scan.sweep.calibration.as_ref().map_or(0, |table| table.lasers.len());
-        Some(best(scans.iter().map(|scan| merits(scan, lasers(scan)))))
+        Some(best(scans.iter().map(|scan| merits(scan, lasers(scan), sectors(scan)))))
     }
 }
 
@@ -95,26 +98,27 @@ fn best(merits: impl Iterator<Item = Merits>) -> usize {
     merits.enumerate().reduce(later).map_or(0, |(index, _)| index)
 }
 
-fn merits(scan: &SensorScan, lasers: usize) -> Merits {
-    let [x, y, _] = scan.origin_m;
-    let sector = |x: f32, y: f32| {
-        (libm::atan2f(y, x).rem_euclid(std::f32::consts::TAU) / std::f32::consts::TAU) * SECTORS as f32
-    };
-    let seen = scan
-        .sweep
-        .x
-        .iter()
-        .zip(&scan.sweep.y)
-        .fold(0u32, |seen, (px, py)| seen | 1 << (sector(px - x, py - y) as u32).min(SECTORS - 1));
+/// The properties of a sensor that has returns in so many sectors.
+fn merits(scan: &SensorScan, lasers: usize, sectors: u32) -> Merits {
     Merits {
         is_there: !scan.is_withdrawn(),
         has_elevations: lasers > 0,
         is_upright: scan.tilt_rad <= UPRIGHT_RAD_MAX,
-        sees_all_around: seen.count_ones() >= SECTORS_ALL_AROUND,
+        sees_all_around: sectors >= SECTORS_ALL_AROUND,
         lasers,
-        sectors: seen.count_ones(),
+        sectors,
         uprightness: -((scan.tilt_rad.to_degrees() / 5.0) as i32),
     }
+}
+
+/// Number of sectors in which a scan has returns.
+fn sectors(scan: &SensorScan) -> u32 {
+    let [x, y, _] = scan.origin_m;
+    let sector = |x: f32, y: f32| {
+        (libm::atan2f(y, x).rem_euclid(std::f32::consts::TAU) / std::f32::consts::TAU) * SECTORS as f32
+    };
+    let points = scan.sweep.x.iter().zip(&scan.sweep.y);
+    points.fold(0u32, |seen, (px, py)| seen | 1 << (sector(px - x, py - y) as u32).min(SECTORS - 1)).count_ones()
 }
 
 #[cfg(test)]
@@ -131,6 +135,10 @@ mod tests {
         scan
     }
 
+    fn merits(scan: &SensorScan, lasers: usize) -> Merits {
+        super::merits(scan, lasers, sectors(scan))
+    }
+
     #[test]
     fn an_upright_sensor_that_sees_all_around_with_many_lasers_is_best() {
         let order = [
@@ -144,5 +152,22 @@ mod tests {
         assert!(order.is_sorted_by(|worse, better| worse < better), "{order:?}");
         assert_eq!(best(order.into_iter()), 5);
         assert_eq!(best([order[3], order[5], order[5]].into_iter()), 1, "the first of two equal sensors");
+    }
+
+    #[test]
+    fn a_declared_sensor_is_chosen_only_while_no_configured_one_has_a_scan() {
+        let seen = |sectors| SensorScan { completed: 1, ..scan(0.0, sectors) };
+        let at = |event_ns| EventTime { event_ns, ..EventTime::default() };
+        let mut choice = ReferenceChoice::new(false, 2, 100);
+        // Two configured sensors, and a declared one that sees more.
+        let silent = || scan(0.0, 0);
+        assert_eq!(choice.by_scans(&[silent(), silent(), seen(12)], at(0)), None);
+        assert_eq!(choice.by_scans(&[silent(), silent(), seen(12)], at(101)), Some(2));
+        assert_eq!(choice.by_scans(&[seen(3), silent(), seen(12)], at(102)), Some(0));
+        assert_eq!(choice.by_scans(&[seen(3), silent(), seen(12)], at(103)), None);
+        assert_eq!(choice.by_scans(&[seen(3), seen(4), seen(12)], at(104)), Some(1));
+        assert_eq!(choice.by_scans(&[seen(5), seen(4), seen(12)], at(105)), None, "it is decided");
+        let lasers = [0, 16];
+        assert_eq!(ReferenceChoice::by_configuration(&[silent(), silent(), seen(12)], &lasers), 1);
     }
 }

@@ -35,6 +35,12 @@ pub fn check(
         return Err(Box::new((StatusCode::METHOD_NOT_ALLOWED, [(header::ALLOW, "GET, HEAD")], text).into_response()));
     }
     let headers = request.headers();
+    for name in [header::HOST, header::ORIGIN] {
+        let values: Vec<_> = headers.get_all(&name).iter().collect();
+        if values.len() > 1 || values.iter().any(|value| value.to_str().is_err()) {
+            return Err(refuse(StatusCode::BAD_REQUEST, format!("{name}: one value of ASCII characters is allowed")));
+        }
+    }
     let host = text_of(headers, header::HOST).or_else(|| request.uri().authority().map(Authority::as_str));
     let host = host.unwrap_or_default();
     if !current.is_own_host(host_of(host)) {
