@@ -3,8 +3,8 @@
 //! In: the sensors of the configuration, then their first scans. Out: the index of the reference sensor. Its scans make
 //! the maps and its lasers define the rows of radial maps, so it should stand upright, see all around the vehicle and
 //! have many lasers. Until every sensor has completed a scan, or the deadline has passed since the first scan, the
-//! configuration alone decides; then the scans decide, once. A sensor that a stream has declared is chosen only while no
-//! configured one has completed a scan, because it may be withdrawn at any time. Events alone decide, so a replay
+//! configuration alone decides; then the scans decide, once. A sensor that a stream has declared is chosen only while
+//! no configured one has completed a scan, because it may be withdrawn at any time. Events alone decide, so a replay
 //! chooses the same sensor.
 
 use crate::event_time::EventTime;
