@@ -1,11 +1,14 @@
-//! The engine's time for the observations that wait for it: all of one vehicle together, and a share for each sender.
+//! The engine's time for the observations that wait for it, by turns of their senders.
 //!
-//! The sender that has had the least time is next (start-time fair queuing: Goyal, Vin and Cheng, SIGCOMM 1996), so that
-//! the scans of a sender that takes less than an equal part wait for one scan of the others, however many send more.
+//! Little waits in the queue of the engine, so that a packet that comes over UDP is not late behind it; the rest waits
+//! with its sender. The sender that has had the least time is next (start-time fair queuing: Goyal, Vin and Cheng,
+//! SIGCOMM 1996), so that the scans of a sender that takes less than an equal part wait for one scan of the others,
+//! however many send more.
 
 use std::collections::BTreeMap;
 use std::future::{pending, ready};
 use std::net::IpAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
@@ -17,37 +20,32 @@ use tokio::sync::oneshot;
 use crate::base::sync::locked;
 use crate::status::map_time::MapTime;
 
-/// Number of senders whose waiting points together take the time that a map may take. Ours: beside one that sends more
-/// than the engine can map, the scan of another waits an eighth of the time for which a map is valid, and its own.
-const SHARES: u32 = 4;
 /// Returns of a packet, at most: those of a Velodyne have 12 blocks of 32.
 const PACKET_RETURNS: usize = 384;
 
 /// The engine's time for the points of one observation; free again when this is dropped. Empty for an observation
 /// without points.
 #[derive(Debug, Default)]
-pub struct EngineTime(Option<Taken>);
-
-#[derive(Debug)]
-struct Taken {
-    time: Time,
-    turns: Arc<Mutex<Turns>>,
+pub struct EngineTime {
+    us: u64,
+    turns: Option<Arc<Mutex<Turns>>>,
 }
 
 /// The engine's time for the observations of one vehicle.
 #[derive(Debug)]
 pub struct EngineTimes {
     map_time: Arc<MapTime>,
-    /// Longest time for all waiting points.
-    most: Duration,
+    /// Time for the points in the engine's queue.
+    most_us: u64,
     turns: Arc<Mutex<Turns>>,
     /// The hosts that have streams.
-    hosts: Mutex<BTreeMap<IpAddr, Weak<Mutex<Sender>>>>,
+    hosts: Mutex<BTreeMap<IpAddr, Weak<AtomicU64>>>,
 }
 
-/// The part of the engine's time that the points of one sender may take.
+/// One sender: the time in microseconds that it has had, its waiting observations included; used only while the turns
+/// are locked.
 #[derive(Clone, Debug)]
-pub struct TimeShare(Arc<Mutex<Sender>>);
+pub struct Sender(Arc<AtomicU64>);
 
 /// An observation whose points wait until the engine has time for them.
 pub struct Waiting {
@@ -73,56 +71,38 @@ struct Turns {
 struct Turn {
     /// The time that its sender has had before it.
     start: u64,
-    time: Time,
+    takes: u64,
     granted: oneshot::Sender<EngineTime>,
 }
 
-/// The time for one observation: of the vehicle's, and of its sender's share.
-#[derive(Clone, Debug)]
-struct Time {
-    of_vehicle: u64,
-    of_sender: u64,
-    sender: Arc<Mutex<Sender>>,
-}
-
-/// One sender; used only while the turns are locked.
-#[derive(Debug)]
-struct Sender {
-    /// What is left of its share.
-    free: u64,
-    /// The time that it has had, its waiting observations included; at most a share behind that of one who always
-    /// waits, so that a sender that was silent does not hold up the others for long.
-    had: u64,
-}
-
 impl EngineTimes {
-    /// Time for points whose maps take `most` together, by `map_time`.
+    /// Points whose maps take `most` together, by `map_time`, are in the engine's queue at most; or one observation.
     pub fn new(map_time: Arc<MapTime>, most: Duration) -> Self {
-        let turns = Turns { free: micros(most), now: 0, waiting: Vec::new() };
-        Self { map_time, most, turns: Arc::new(Mutex::new(turns)), hosts: Mutex::default() }
+        let most_us = micros(most);
+        let turns = Turns { free: most_us, now: 0, waiting: Vec::new() };
+        Self { map_time, most_us, turns: Arc::new(Mutex::new(turns)), hosts: Mutex::default() }
     }
 
-    /// A share for one sender.
-    pub fn share(&self) -> TimeShare {
-        let sender = Sender { free: micros(self.most / SHARES), had: locked(&self.turns).now };
-        TimeShare(Arc::new(Mutex::new(sender)))
+    /// A sender that has had as much time as one who always waits.
+    pub fn sender(&self) -> Sender {
+        Sender(Arc::new(locked(&self.turns).now.into()))
     }
 
-    /// The share that all streams of this host have in common.
-    pub fn share_of(&self, host: IpAddr) -> TimeShare {
+    /// The sender of all streams of this host.
+    pub fn sender_at(&self, host: IpAddr) -> Sender {
         let mut hosts = locked(&self.hosts);
-        hosts.retain(|_, share| share.strong_count() > 0);
-        if let Some(share) = hosts.get(&host).and_then(Weak::upgrade) {
-            return TimeShare(share);
+        hosts.retain(|_, sender| sender.strong_count() > 0);
+        if let Some(sender) = hosts.get(&host).and_then(Weak::upgrade) {
+            return Sender(sender);
         }
-        let share = self.share();
-        hosts.insert(host, Arc::downgrade(&share.0));
-        share
+        let sender = self.sender();
+        hosts.insert(host, Arc::downgrade(&sender.0));
+        sender
     }
 
     /// An observation of `bytes` bytes that waits until the points before it leave the engine time for it, so that no
     /// map is late because points came faster than maps are made. Only a scan and packets wait.
-    pub fn wait(&self, observation: v1::Observation, bytes: usize, share: &TimeShare) -> Waiting {
+    pub fn wait(&self, observation: v1::Observation, bytes: usize, sender: &Sender) -> Waiting {
         let takes = match &observation.body {
             Some(v1::observation::Body::Scan(scan)) => {
                 let rays = scan.x.len() / size_of::<f32>() + scan.no_returns.len() / size_of::<[f32; 3]>();
@@ -133,58 +113,44 @@ impl EngineTimes {
             }
             _ => return Waiting { observation, bytes, time: ready(EngineTime::default()).boxed() },
         };
-        let [of_sender, of_vehicle] = [self.most / SHARES, self.most].map(|most| micros(takes.min(most)));
-        let time = Time { of_vehicle, of_sender, sender: share.0.clone() };
         let (granted, turn) = oneshot::channel();
-        locked(&self.turns).add(time, micros(self.most / SHARES), granted, &self.turns);
-        // The turns outlive the observation, and end no turn without a grant.
+        let mut turns = locked(&self.turns);
+        // A sender that was silent is before the others for as much as may be queued, and not for longer.
+        let start = sender.0.load(Ordering::Relaxed).max(turns.now.saturating_sub(self.most_us));
+        let takes = micros(takes);
+        sender.0.store(start + takes, Ordering::Relaxed);
+        turns.waiting.push(Turn { start, takes: takes.min(self.most_us), granted });
+        turns.grant(&self.turns);
+        // No turn ends without a grant, because the observation waits for it.
         let time = async move { turn.await.unwrap_or_default() };
         Waiting { observation, bytes, time: time.boxed() }
     }
 }
 
 impl Turns {
-    /// Adds a turn, whose sender starts at most `behind` behind one who always waits.
-    fn add(&mut self, time: Time, behind: u64, granted: oneshot::Sender<EngineTime>, turns: &Arc<Mutex<Self>>) {
-        let mut sender = locked(&time.sender);
-        let start = sender.had.max(self.now.saturating_sub(behind));
-        sender.had = start + time.of_vehicle;
-        drop(sender);
-        self.waiting.push(Turn { start, time, granted });
-        self.grant(turns);
-    }
-
     /// Grants the turns for which there is time. One that needs more than is free is not passed by another.
     fn grant(&mut self, turns: &Arc<Mutex<Self>>) {
         self.waiting.retain(|turn| !turn.granted.is_closed());
-        let has_share = |turn: &Turn| locked(&turn.time.sender).free >= turn.time.of_sender;
-        loop {
-            let ready = self.waiting.iter().enumerate().filter(|(_, turn)| has_share(turn));
-            let next = ready.min_by_key(|(_, turn)| turn.start);
-            let Some((at, _)) = next.filter(|(_, turn)| turn.time.of_vehicle <= self.free) else { return };
-            let Turn { start, time, granted } = self.waiting.remove(at);
+        while let Some((at, next)) = self.waiting.iter().enumerate().min_by_key(|(_, turn)| turn.start)
+            && next.takes <= self.free
+        {
+            let Turn { start, takes, granted } = self.waiting.remove(at);
             self.now = self.now.max(start);
-            self.free -= time.of_vehicle;
-            locked(&time.sender).free -= time.of_sender;
-            let taken = EngineTime(Some(Taken { time, turns: turns.clone() }));
-            // The observation may have ended by now.
-            if let Some(Taken { time, .. }) = granted.send(taken).err().and_then(|mut unwanted| unwanted.0.take()) {
-                self.give_back(&time);
+            self.free -= takes;
+            // The observation may have ended by now. Its time must not be dropped while the turns are locked.
+            if let Err(mut unwanted) = granted.send(EngineTime { us: takes, turns: Some(turns.clone()) }) {
+                unwanted.turns = None;
+                self.free += takes;
             }
         }
-    }
-
-    fn give_back(&mut self, time: &Time) {
-        self.free += time.of_vehicle;
-        locked(&time.sender).free += time.of_sender;
     }
 }
 
 impl Drop for EngineTime {
     fn drop(&mut self) {
-        if let Some(Taken { time, turns }) = self.0.take() {
+        if let Some(turns) = self.turns.take() {
             let mut all = locked(&turns);
-            all.give_back(&time);
+            all.free += self.us;
             all.grant(&turns);
         }
     }
@@ -230,7 +196,7 @@ mod tests {
     #[test]
     fn a_scan_waits_until_those_before_it_leave_the_engine_time() {
         let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
-        let wait = |observation| at_once(times.wait(observation, 0, &times.share()));
+        let wait = |observation| at_once(times.wait(observation, 0, &times.sender()));
         let [first, second] = [(); 2].map(|()| wait(scan(80_000)).expect("10 of 20 ms"));
         assert!(wait(scan(80_000)).is_none(), "two scans of 10 ms wait for the engine");
         assert!(wait(packets(100)).is_none(), "38,400 returns, 3.8 ms");
@@ -243,23 +209,11 @@ mod tests {
     }
 
     #[test]
-    fn the_scans_of_one_sender_wait_for_its_share_and_not_those_of_another() {
-        let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
-        let [flood, other] = [(); 2].map(|()| times.share());
-        let first = at_once(times.wait(scan(30_000), 0, &flood)).expect("5 of 5 ms");
-        let mut second = Some(times.wait(scan(30_000), 0, &flood));
-        assert!(Waiting::time(&mut second).now_or_never().is_none(), "its share is taken");
-        let _other = at_once(times.wait(scan(30_000), 0, &other)).expect("a share of its own");
-        drop(first);
-        assert!(Waiting::time(&mut second).now_or_never().is_some(), "the observation that has waited goes on");
-    }
-
-    #[test]
     fn a_sender_of_small_scans_is_next_beside_many_that_send_more_than_the_engine_maps() {
         let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
-        let [honest, floods] = [1, 16].map(|count| (0..count).map(|_| times.share()).collect::<Vec<_>>());
+        let [honest, floods] = [1, 16].map(|count| (0..count).map(|_| times.sender()).collect::<Vec<_>>());
         // Scans of 5 ms: four are granted, one of each flood waits, so that each gets a 17th of the time.
-        let wait = |points, share| Some(times.wait(scan(points), 0, share));
+        let wait = |points, sender| Some(times.wait(scan(points), 0, sender));
         let mut waiting: Vec<_> = floods.iter().map(|flood| (flood, wait(30_000, flood))).collect();
         let mut granted = std::collections::VecDeque::new();
         let (mut own, mut waited, mut maps) = (None, 0, Vec::new());
@@ -287,39 +241,41 @@ mod tests {
     }
 
     #[test]
-    fn a_sender_that_was_silent_is_not_long_before_the_others() {
+    fn a_sender_that_was_silent_is_before_the_others_for_as_much_as_may_be_queued() {
         let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
-        let [silent, busy] = [(); 2].map(|()| times.share());
+        let [silent, busy] = [(); 2].map(|()| times.sender());
         (0..1000).for_each(|_| drop(at_once(times.wait(scan(30_000), 0, &busy)).expect("all time is free")));
-        let _all = [(); 3].map(|()| at_once(times.wait(scan(30_000), 0, &times.share())).expect("5 of 20 ms"));
-        let first = at_once(times.wait(scan(30_000), 0, &silent)).expect("the last 5 of 20 ms");
-        let mut next_of_silent = Some(times.wait(scan(30_000), 0, &silent));
-        let mut next_of_busy = Some(times.wait(scan(30_000), 0, &busy));
-        drop(first);
-        assert!(Waiting::time(&mut next_of_busy).now_or_never().is_none());
-        drop(Waiting::time(&mut next_of_silent).now_or_never().expect("it had as much time less"));
-        assert!(Waiting::time(&mut next_of_busy).now_or_never().is_some());
+        let whole = at_once(times.wait(scan(180_000), 0, &times.sender())).expect("20 of 20 ms");
+        let mut of_busy = Some(times.wait(scan(180_000), 0, &busy));
+        let mut of_silent: Vec<_> = (0..10).map(|_| Some(times.wait(scan(180_000), 0, &silent))).collect();
+        drop(whole);
+        let granted = |waiting: &mut Option<Waiting>| Waiting::time(waiting).now_or_never();
+        let before = (0..10).take_while(|at| granted(&mut of_silent[*at]).is_some()).count();
+        assert_eq!(before, 2, "it had 5,000 ms less; of these 20 count, and the 5 of the other's newest scan");
+        assert!(granted(&mut of_busy).is_some());
     }
 
     #[test]
     fn an_observation_that_ends_while_it_waits_takes_no_time() {
         let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
-        let [first, second] = [(); 2].map(|()| times.share());
+        let [first, second] = [(); 2].map(|()| times.sender());
         let whole = at_once(times.wait(scan(180_000), 0, &first)).expect("20 of 20 ms");
         let ended = times.wait(scan(180_000), 0, &second);
-        let mut next = Some(times.wait(scan(180_000), 0, &times.share()));
+        let mut next = Some(times.wait(scan(180_000), 0, &times.sender()));
         drop(ended);
         drop(whole);
         assert!(Waiting::time(&mut next).now_or_never().is_some());
     }
 
     #[test]
-    fn all_streams_of_a_host_have_one_share() {
+    fn all_streams_of_a_host_are_one_sender() {
         let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
-        let [first, second] = [[127, 0, 0, 1], [127, 0, 0, 1]].map(|host| times.share_of(host.into()));
-        let _first = at_once(times.wait(scan(30_000), 0, &first)).expect("5 of 5 ms");
-        assert!(at_once(times.wait(scan(30_000), 0, &second)).is_none());
-        let other = times.share_of([127, 0, 0, 2].into());
-        assert!(at_once(times.wait(scan(30_000), 0, &other)).is_some());
+        let [first, second] = [[127, 0, 0, 1], [127, 0, 0, 1]].map(|host| times.sender_at(host.into()));
+        let whole = at_once(times.wait(scan(180_000), 0, &first)).expect("20 of 20 ms");
+        let mut of_second = Some(times.wait(scan(180_000), 0, &second));
+        let mut of_other = Some(times.wait(scan(180_000), 0, &times.sender_at([127, 0, 0, 2].into())));
+        drop(whole);
+        assert!(Waiting::time(&mut of_second).now_or_never().is_none(), "its host has had 20 ms");
+        assert!(Waiting::time(&mut of_other).now_or_never().is_some());
     }
 }

@@ -21,6 +21,10 @@ use crate::base::sync::locked;
 use crate::config::Vehicle;
 use crate::status::map_time::MapTime;
 
+/// Part of the longest time for a map that the points in the engine's queue may take, beside UDP's. Ours: three scans of
+/// an HDL-64E, so that the engine always has one while another is decoded, and a packet of UDP does not wait long.
+const QUEUED_PART: u32 = 4;
+
 /// The gateway of one vehicle.
 #[derive(Debug)]
 pub struct Gateway {
@@ -92,7 +96,7 @@ impl Gateway {
                 newest_scans: BTreeMap::new(),
             }),
             streams: StreamPlaces::new(streams_max, (streams_max / 4).max(1)),
-            time: EngineTimes::new(map_time.clone(), map_time_max),
+            time: EngineTimes::new(map_time.clone(), map_time_max / QUEUED_PART),
             map_time,
             map_time_max,
             queue: queue.clone(),
@@ -369,8 +373,9 @@ mod tests {
         let gateway = Gateway::new(&vehicle(40), &queue, Arc::default());
         let (outcomes, _reports) = unbounded_channel();
         let mut session = ClientSession::new(0);
-        let share = gateway.time.share();
-        let time = |number| Waiting::time(&mut Some(gateway.time.wait(scan(number, 80_000), 0, &share))).now_or_never();
+        let sender = gateway.time.sender();
+        let time =
+            |number| Waiting::time(&mut Some(gateway.time.wait(scan(number, 80_000), 0, &sender))).now_or_never();
         gateway.push(scan(1, 80_000), 0, time(1).expect("nothing waits"), &mut session, &outcomes).unwrap();
         assert!(time(2).is_none(), "the first scan waits for the engine");
         drop(events.recv().unwrap());

@@ -16,7 +16,7 @@ use prost::Message;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
-use super::engine_time::{EngineTime, TimeShare, Waiting};
+use super::engine_time::{EngineTime, Sender, Waiting};
 use super::gateway::{Gateway, Gateways};
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 use super::stream_places::StreamPlace;
@@ -56,12 +56,12 @@ impl IngestService for Ingest {
     ) -> Result<Response<Self::StreamStream>, Status> {
         let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
         let connection = request.extensions().get::<Arc<Place>>().cloned();
-        let sender = connection.as_ref().map_or(Ipv4Addr::UNSPECIFIED.into(), |place| place.host());
+        let host = connection.as_ref().map_or(Ipv4Addr::UNSPECIFIED.into(), |place| place.host());
         let full = |of: &str, error| {
             connection.as_ref().inspect(|place| place.count("streams"));
             Status::resource_exhausted(format!("{of}: {error}; close one first"))
         };
-        let unnamed = self.gateways.take_unnamed_stream(sender);
+        let unnamed = self.gateways.take_unnamed_stream(host);
         let unnamed = unnamed.map_err(|error| full("streams that have not named their vehicle", error))?;
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
@@ -75,11 +75,11 @@ impl IngestService for Ingest {
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let gateway = self.gateways.find(&first.vehicle)?.clone();
         caller.check_vehicle(&gateway.vehicle)?;
-        let place = gateway.take_stream(sender);
+        let place = gateway.take_stream(host);
         let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
         drop(unnamed);
-        let share = gateway.time.share_of(sender);
-        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), share, place);
+        let sender = gateway.time.sender_at(host);
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), sender, place);
         if first.body.is_none() {
             stream.acknowledge_opening(&first);
         } else {
@@ -94,7 +94,7 @@ struct IngestStream {
     /// `None` once the stream reads no more observations.
     observations: Option<Streaming<v1::Observation>>,
     waiting: Option<Waiting>,
-    share: TimeShare,
+    sender: Sender,
     gateway: Arc<Gateway>,
     gateways: Gateways,
     session: ClientSession,
@@ -111,14 +111,14 @@ impl IngestStream {
         observations: Streaming<v1::Observation>,
         gateway: Arc<Gateway>,
         gateways: Gateways,
-        share: TimeShare,
+        sender: Sender,
         place: StreamPlace,
     ) -> Self {
         let (outcome_sender, outcomes) = unbounded_channel();
         Self {
             observations: Some(observations),
             waiting: None,
-            share,
+            sender,
             gateway,
             gateways,
             session: ClientSession::new(0),
@@ -179,7 +179,7 @@ impl IngestStream {
     fn wait_for_time(&mut self, mut observation: v1::Observation) {
         observation.client = 0;
         let bytes = observation.encoded_len();
-        self.waiting = Some(self.gateway.time.wait(observation, bytes, &self.share));
+        self.waiting = Some(self.gateway.time.wait(observation, bytes, &self.sender));
     }
 
     fn push_waiting(&mut self, time: EngineTime) {

@@ -9,7 +9,7 @@
 //! | [`gateway`] | one observation of a client -> events on the queue of its vehicle |
 //! | [`observation`] | `clearway.v1.Observation` -> event bodies, or the reason of the refusal |
 //! | [`stream_places`] | streams of senders -> places: so many at once, and never all for one sender |
-//! | [`engine_time`] | observations with points -> those that the engine has time for, a share for each sender |
+//! | [`engine_time`] | observations with points -> those that the engine has time for, by turns of their senders |
 //! | [`receipt`] | outcome of an event -> report to its client |
 //! | [`ros`] | ROS 2 messages, live or from a file -> readings |
 //! | [`files`] | captures, MCAP files, scans -> readings |

@@ -133,23 +133,21 @@ impl Queues {
         (Self { all: Vec::new(), opened, bytes: Arc::default(), count: Arc::default(), gateway }, receiver)
     }
 
-    /// Queues a sample. False if it exceeds a bound: a source with queued samples gets another one only while they have
-    /// at most half the bytes of the vehicle's longest message, and a sixteenth of them if the samples of all sources
-    /// have more than four times its bytes. Of a sample that is too long only the length is queued.
+    /// Queues a sample. False if it exceeds a bound: the samples of all sources together have at most the bytes of the
+    /// vehicle's longest message, and beyond them each source has an equal part of as many bytes. Of a sample that is
+    /// too long only the length is queued.
     fn push(&mut self, source: Option<ZenohId>, key: &str, payload: &ZBytes, now: Instant) -> bool {
         let bytes_max = self.gateway.limits.message_bytes_max;
         let of_vehicle = self.bytes.clone();
         let Some(queue) = self.get_or_open(source, now) else { return false };
         queue.heard = now;
-        let [before, all] = [&queue.bytes, &of_vehicle].map(|count| count.load(Ordering::Relaxed));
-        let part = if all > 4 * bytes_max { bytes_max / SOURCES_MAX } else { bytes_max / 2 };
-        if before > part {
-            return false;
-        }
         let length = payload.len();
         let payload = if length > bytes_max { ZBytes::new() } else { payload.clone() };
-        let queued = QueuedBytes::new(payload.len(), [queue.bytes.clone(), of_vehicle]);
-        queue.samples.try_send(QueuedSample { key: key.to_owned(), payload, length, queued }).is_ok()
+        let queued = QueuedBytes::new(payload.len(), [queue.bytes.clone(), of_vehicle.clone()]);
+        let samples = queue.samples.clone();
+        let [own, all] = [&queue.bytes, &of_vehicle].map(|count| count.load(Ordering::Relaxed));
+        let fits = all <= bytes_max || own <= bytes_max / self.all.len();
+        fits && samples.try_send(QueuedSample { key: key.to_owned(), payload, length, queued }).is_ok()
     }
 
     /// The queue of this source; `None` if it is new and no other may end for it.
@@ -169,8 +167,8 @@ impl Queues {
         }
         let (samples, receiver) = channel(SAMPLES_MAX);
         let is_accepted = Arc::<AtomicBool>::default();
-        let share = self.gateway.time.share();
-        let opened = Source::new(source, receiver, self.count.clone(), is_accepted.clone(), share);
+        let sender = self.gateway.time.sender();
+        let opened = Source::new(source, receiver, self.count.clone(), is_accepted.clone(), sender);
         // An error means that the server stops.
         self.opened.send(opened).ok()?;
         self.count.store(self.all.len() + 1, Ordering::Relaxed);
@@ -216,22 +214,21 @@ mod tests {
     }
 
     #[test]
-    fn many_sources_together_are_bounded_and_each_may_have_a_sample() {
+    fn many_sources_together_are_bounded_and_each_has_an_equal_part() {
         let (mut queues, mut opened) = queues(1000);
         let now = Instant::now();
-        let large = ZBytes::from(vec![0; 97_000]);
         let small = ZBytes::from(vec![0; 1000]);
-        for source in 1..SOURCES_MAX as u8 {
-            assert!(queues.push(session(source), "scan/top", &large, now), "source {source}");
+        assert!(queues.push(session(1), "scan/top", &ZBytes::from(vec![0; 97_000]), now));
+        assert!(!queues.push(session(1), "pose", &small, now), "a longest message has 97,536 bytes");
+        for source in 2..=SOURCES_MAX {
+            let queued = (0..100).filter(|_| queues.push(session(source as u8), "pose", &small, now)).count();
+            assert_eq!(queued, 97_536 / source / 1000, "of {source} sources");
         }
-        assert!(!queues.push(session(1), "pose", &small, now), "more than four longest messages are queued");
-        let last = (0..100).filter(|_| queues.push(session(16), "pose", &small, now)).count();
-        assert_eq!(last, 7, "a sixteenth of a longest message is free for each source, and one sample");
         let too_long = ZBytes::from(vec![0; 1 << 20]);
         let mut sources: Vec<_> = std::iter::from_fn(|| opened.try_recv().ok()).collect();
-        drop(sources.split_off(4));
+        drop(sources.split_off(1));
         assert!(queues.push(session(17), "scan/top", &too_long, now), "its client learns what is allowed");
-        assert_eq!(queues.bytes.load(Ordering::Relaxed), 4 * 97_000, "a source that ends gives its bytes back");
+        assert_eq!(queues.bytes.load(Ordering::Relaxed), 97_000, "a source that ends gives its bytes back");
         drop(sources);
     }
 

@@ -13,7 +13,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
 use zenoh::session::ZenohId;
 
-use super::engine_time::{EngineTime, TimeShare, Waiting};
+use super::engine_time::{EngineTime, Sender, Waiting};
 use super::gateway::Gateway;
 use super::observation::ObservationError;
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
@@ -76,7 +76,7 @@ pub(super) struct Source {
     sources: Arc<AtomicUsize>,
     /// True if an observation was accepted.
     is_accepted: Arc<AtomicBool>,
-    share: TimeShare,
+    sender: Sender,
     clients: Clients,
     /// The observation that waits for the engine's time, and its bytes.
     waiting: Option<Waiting>,
@@ -90,10 +90,10 @@ impl Source {
         samples: Receiver<QueuedSample>,
         sources: Arc<AtomicUsize>,
         is_accepted: Arc<AtomicBool>,
-        share: TimeShare,
+        sender: Sender,
     ) -> Self {
         let (clients, waiting, waiting_bytes) = (Clients::default(), None, None);
-        Self { id, samples, sources, is_accepted, share, clients, waiting, waiting_bytes }
+        Self { id, samples, sources, is_accepted, sender, clients, waiting, waiting_bytes }
     }
 
     /// Decodes the samples and sends reports, until the channel is closed and everything is reported.
@@ -187,7 +187,7 @@ impl Source {
                 return gateway.refuse(session, number, "key", message);
             }
         }
-        self.waiting = Some(gateway.time.wait(observation, length, &self.share));
+        self.waiting = Some(gateway.time.wait(observation, length, &self.sender));
         self.waiting_bytes = Some(queued);
     }
 

@@ -6,9 +6,9 @@
 //! | [`sockets`] | every TCP listener: silence, single bytes, half headers, many connections |
 //! | [`browsers`] | the page: WebSocket frames and requests without pause, frames that are too long |
 //! | [`datagrams`] | UDP: floods of datagrams that are no packets, and of packets of another sender |
-//! | [`peers`] | zenoh: junk, forged maps, false answers |
+//! | [`peers`] | zenoh: junk, forged maps, large scans without pause, false answers |
 //! | [`target`] | what they have in common |
-//! | [`watch`] | the healthy readers beside the attacks, and the server's memory |
+//! | [`watch`] | the healthy readers and sender beside the attacks, and the server's memory |
 
 pub mod browsers;
 pub mod datagrams;

@@ -4,11 +4,16 @@ use std::time::Duration;
 
 use clearway_client::now_ns;
 use clearway_proto::map::{encode_header, encode_layer};
+use clearway_proto::packed::pack;
 use clearway_proto::v1;
 use futures::FutureExt;
+use prost::Message;
 use zenoh::Session;
+use zenoh::qos::CongestionControl;
+use zenoh::sample::SourceInfo;
 
 use super::target::Attack;
+use super::watch::plain;
 
 const MAPS: &str = "clearway/car/map/drivability";
 /// Samples between two pauses.
@@ -31,6 +36,8 @@ pub const ATTACKS: &[Attack] = &[
         name: "zenoh: 1 MiB as observations",
         run: |target| flood(target.zenoh, "clearway/car/ingest/scan/top", long).boxed(),
     },
+    Attack { name: "zenoh: 1 session of large scans", run: |target| large_scans(target.zenoh, 1).boxed() },
+    Attack { name: "zenoh: 16 sessions of large scans", run: |target| large_scans(target.zenoh, 16).boxed() },
     Attack { name: "zenoh: false answers and heartbeats", run: |target| answer(target.zenoh).boxed() },
 ];
 
@@ -84,6 +91,33 @@ fn junk(number: u64) -> Vec<u8> {
 
 fn long(_: u64) -> Vec<u8> {
     vec![0xff; 1 << 20]
+}
+
+/// Declares a sensor, and sends scans of 300,000 points for it in all sessions, as fast as it can.
+async fn large_scans(endpoint: String, sessions: u64) {
+    let declared = v1::Sensor { name: "large".into(), model: Some("hdl32e".into()), z_m: 1.9, ..Default::default() };
+    let [x, y, z] = plain(300_000).map(|list| pack(&list));
+    let send = async |client: u64| {
+        let Some(session) = session(&endpoint).await else { return };
+        for number in 1.. {
+            let (key, body) = match number {
+                1 => ("sensor", v1::observation::Body::Declaration(declared.clone())),
+                _ => {
+                    let [x, y, z] = [&x, &y, &z].map(Clone::clone);
+                    (
+                        "scan",
+                        v1::observation::Body::Scan(v1::Scan { stamp_ns: now_ns(), x, y, z, ..Default::default() }),
+                    )
+                }
+            };
+            let observation = v1::Observation { client, number, body: Some(body), ..Default::default() };
+            let put = session.put(format!("clearway/car/ingest/{key}/large"), observation.encode_to_vec());
+            let source = SourceInfo::new(session.id(), number as u32);
+            let _closed = put.congestion_control(CongestionControl::Block).source_info(source).await;
+            tokio::task::yield_now().await;
+        }
+    };
+    futures::future::join_all((1..=sessions).map(send)).await;
 }
 
 /// Answers every query for maps with junk, and states new last maps all the time.

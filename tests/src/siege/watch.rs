@@ -1,17 +1,20 @@
-//! The healthy readers beside an attack, a newcomer, and the server's memory: what an attack costs.
+//! The healthy readers and the healthy sender beside an attack, a newcomer, and the server's memory: what an attack
+//! costs.
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use clearway_client::{Client, ClientError, MapStream, Subscription, ZenohClient, now_ns};
+use clearway_client::{Client, ClientError, MapStream, Observation, Subscription, ZenohClient, now_ns};
 
 use super::target::Target;
 
 /// Longest time that a reader waits for one map, or a newcomer for its first.
 const PATIENCE: Duration = Duration::from_secs(5);
+/// Time between two scans of the sender.
+const SCAN_PERIOD: Duration = Duration::from_millis(100);
 
 /// What one reader has seen since the last [`Reader::take`].
 #[derive(Clone, Debug, Default)]
@@ -98,6 +101,64 @@ async fn read(target: &Target, over_zenoh: bool, seen: &Mutex<Seen>, stop: &Atom
             passed_over = hostile;
         }
     }
+}
+
+/// A sender over zenoh of ten scans a second of a plain, in a thread and a runtime of its own.
+pub struct Sender {
+    lost: Arc<AtomicU64>,
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+}
+
+impl Sender {
+    /// Starts to send the scans of the sensor `side`.
+    pub fn start(target: &Target) -> Self {
+        let (lost, stop, target) = (Arc::<AtomicU64>::default(), Arc::<AtomicBool>::default(), target.clone());
+        let thread = std::thread::spawn({
+            let (lost, stop) = (lost.clone(), stop.clone());
+            move || {
+                let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+                let sent = runtime.expect("a runtime").block_on(send(&target, &lost, &stop));
+                sent.expect("the server accepts a sender");
+            }
+        });
+        Self { lost, stop, thread }
+    }
+
+    /// Scans since the last call that were refused, or not sent because those before them were not acknowledged.
+    pub fn take(&self) -> u64 {
+        self.lost.swap(0, Ordering::Relaxed)
+    }
+
+    /// Ends it.
+    pub fn stop(self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.join().expect("the sender does not panic");
+    }
+}
+
+async fn send(target: &Target, lost: &AtomicU64, stop: &AtomicBool) -> Result<(), ClientError> {
+    let mut ingester = ZenohClient::connect(&target.zenoh).await?.ingest("car").await?;
+    let [x, y, z] = plain(20_000);
+    let mut due = tokio::time::interval(SCAN_PERIOD);
+    due.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+    while !stop.load(Ordering::Relaxed) {
+        due.tick().await;
+        let began = Instant::now();
+        ingester.send(Observation::scan("side", now_ns(), &x, &y, &z)).await?;
+        let not_sent = began.elapsed().as_millis() / SCAN_PERIOD.as_millis();
+        let refused = ingester.refusals().len();
+        lost.fetch_add(not_sent as u64 + refused as u64, Ordering::Relaxed);
+    }
+    Ok(())
+}
+
+/// x, y and z of points on the ground around a sensor at the height of `top`.
+pub fn plain(points: u32) -> [Vec<f32>; 3] {
+    let angle = |ray: u32| ray as f32 * std::f32::consts::TAU * 20.0 / points as f32;
+    let range_m = |ray: u32| 3.0 + (ray % 20) as f32 * 1.5;
+    let list = |of: &dyn Fn(u32) -> f32| (0..points).map(of).collect::<Vec<_>>();
+    [list(&|ray| angle(ray).cos() * range_m(ray)), list(&|ray| angle(ray).sin() * range_m(ray)), list(&|_| -1.9)]
 }
 
 /// Time until a new client has its first map over gRPC; `None` if it has none after [`PATIENCE`].
