@@ -1,15 +1,15 @@
 //! The engine's time for the observations that wait for it, by turns of their senders.
 //!
 //! Little waits in the queue of the engine, so that a packet that comes over UDP is not late behind it; the rest waits
-//! with its sender. The sender that has had the least time is next (start-time fair queuing: Goyal, Vin and Cheng,
-//! SIGCOMM 1996), so that the scans of a sender that takes less than an equal part wait for one scan of the others,
-//! however many send more.
+//! with its sender. The sender that will have had the least time is next (self-clocked fair queuing: Golestani, INFOCOM
+//! 1994), so that the scans of a sender that takes less than an equal part wait for one scan of the others, however many
+//! send more, and no sender waits for ever.
 
 use std::collections::BTreeMap;
 use std::future::{pending, ready};
 use std::net::IpAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use clearway_proto::v1;
@@ -17,6 +17,7 @@ use futures::FutureExt;
 use futures::future::BoxFuture;
 use tokio::sync::oneshot;
 
+use super::observation::PACKETS_MAX;
 use crate::base::sync::locked;
 use crate::status::map_time::MapTime;
 
@@ -38,8 +39,8 @@ pub struct EngineTimes {
     /// Time for the points in the engine's queue.
     most_us: u64,
     turns: Arc<Mutex<Turns>>,
-    /// The hosts that have streams.
-    hosts: Mutex<BTreeMap<IpAddr, Weak<AtomicU64>>>,
+    /// The hosts that have streams, and those that have had more time than one who always waits: they cannot start anew.
+    hosts: Mutex<BTreeMap<IpAddr, Sender>>,
 }
 
 /// One sender: the time in microseconds that it has had, its waiting observations included; used only while the turns
@@ -60,7 +61,7 @@ pub struct Waiting {
 #[derive(Debug)]
 struct Turns {
     free: u64,
-    /// The time that a sender has had who always waits: the start of the newest turn.
+    /// The time that a sender has had who always waits: that of the sender of the newest turn, with it.
     now: u64,
     /// In the order in which they came.
     waiting: Vec<Turn>,
@@ -69,8 +70,8 @@ struct Turns {
 /// One observation that waits for its turn.
 #[derive(Debug)]
 struct Turn {
-    /// The time that its sender has had before it.
-    start: u64,
+    /// The time that its sender has had with it.
+    end: u64,
     takes: u64,
     granted: oneshot::Sender<EngineTime>,
 }
@@ -91,13 +92,9 @@ impl EngineTimes {
     /// The sender of all streams of this host.
     pub fn sender_at(&self, host: IpAddr) -> Sender {
         let mut hosts = locked(&self.hosts);
-        hosts.retain(|_, sender| sender.strong_count() > 0);
-        if let Some(sender) = hosts.get(&host).and_then(Weak::upgrade) {
-            return Sender(sender);
-        }
-        let sender = self.sender();
-        hosts.insert(host, Arc::downgrade(&sender.0));
-        sender
+        let now = locked(&self.turns).now;
+        hosts.retain(|_, Sender(had)| Arc::strong_count(had) > 1 || had.load(Ordering::Relaxed) > now);
+        hosts.entry(host).or_insert_with(|| self.sender()).clone()
     }
 
     /// An observation of `bytes` bytes that waits until the points before it leave the engine time for it, so that no
@@ -109,7 +106,9 @@ impl EngineTimes {
                 self.map_time.of(rays)
             }
             Some(v1::observation::Body::Packets(packets)) => {
-                self.map_time.of_part(packets.lengths.len() / size_of::<u16>() * PACKET_RETURNS)
+                // More packets are refused.
+                let count = (packets.lengths.len() / size_of::<u16>()).min(PACKETS_MAX);
+                self.map_time.of_part(count * PACKET_RETURNS)
             }
             _ => return Waiting { observation, bytes, time: ready(EngineTime::default()).boxed() },
         };
@@ -118,8 +117,9 @@ impl EngineTimes {
         // A sender that was silent is before the others for as much as may be queued, and not for longer.
         let start = sender.0.load(Ordering::Relaxed).max(turns.now.saturating_sub(self.most_us));
         let takes = micros(takes);
-        sender.0.store(start + takes, Ordering::Relaxed);
-        turns.waiting.push(Turn { start, takes: takes.min(self.most_us), granted });
+        let end = start + takes;
+        sender.0.store(end, Ordering::Relaxed);
+        turns.waiting.push(Turn { end, takes: takes.min(self.most_us), granted });
         turns.grant(&self.turns);
         // No turn ends without a grant, because the observation waits for it.
         let time = async move { turn.await.unwrap_or_default() };
@@ -131,11 +131,11 @@ impl Turns {
     /// Grants the turns for which there is time. One that needs more than is free is not passed by another.
     fn grant(&mut self, turns: &Arc<Mutex<Self>>) {
         self.waiting.retain(|turn| !turn.granted.is_closed());
-        while let Some((at, next)) = self.waiting.iter().enumerate().min_by_key(|(_, turn)| turn.start)
+        while let Some((at, next)) = self.waiting.iter().enumerate().min_by_key(|(_, turn)| turn.end)
             && next.takes <= self.free
         {
-            let Turn { start, takes, granted } = self.waiting.remove(at);
-            self.now = self.now.max(start);
+            let Turn { end, takes, granted } = self.waiting.remove(at);
+            self.now = self.now.max(end);
             self.free -= takes;
             // The observation may have ended by now. Its time must not be dropped while the turns are locked.
             if let Err(mut unwanted) = granted.send(EngineTime { us: takes, turns: Some(turns.clone()) }) {
@@ -245,13 +245,16 @@ mod tests {
         let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
         let [silent, busy] = [(); 2].map(|()| times.sender());
         (0..1000).for_each(|_| drop(at_once(times.wait(scan(30_000), 0, &busy)).expect("all time is free")));
-        let whole = at_once(times.wait(scan(180_000), 0, &times.sender())).expect("20 of 20 ms");
+        let whole = at_once(times.wait(scan(180_000), 0, &busy)).expect("20 of 20 ms");
         let mut of_busy = Some(times.wait(scan(180_000), 0, &busy));
-        let mut of_silent: Vec<_> = (0..10).map(|_| Some(times.wait(scan(180_000), 0, &silent))).collect();
+        let mut of_silent: Vec<_> = (0..10).map(|_| Some(times.wait(scan(30_000), 0, &silent))).collect();
         drop(whole);
         let granted = |waiting: &mut Option<Waiting>| Waiting::time(waiting).now_or_never();
         let before = (0..10).take_while(|at| granted(&mut of_silent[*at]).is_some()).count();
-        assert_eq!(before, 2, "it had 5,000 ms less; of these 20 count, and the 5 of the other's newest scan");
+        assert_eq!(
+            before, 7,
+            "scans of 5 ms, from 20 ms before the newest turn to the end of the other's scan of 20 ms"
+        );
         assert!(granted(&mut of_busy).is_some());
     }
 
@@ -273,9 +276,40 @@ mod tests {
         let [first, second] = [[127, 0, 0, 1], [127, 0, 0, 1]].map(|host| times.sender_at(host.into()));
         let whole = at_once(times.wait(scan(180_000), 0, &first)).expect("20 of 20 ms");
         let mut of_second = Some(times.wait(scan(180_000), 0, &second));
-        let mut of_other = Some(times.wait(scan(180_000), 0, &times.sender_at([127, 0, 0, 2].into())));
+        let mut of_other = Some(times.wait(scan(170_000), 0, &times.sender_at([127, 0, 0, 2].into())));
         drop(whole);
         assert!(Waiting::time(&mut of_second).now_or_never().is_none(), "its host has had 20 ms");
         assert!(Waiting::time(&mut of_other).now_or_never().is_some());
+    }
+
+    #[test]
+    fn a_host_whose_streams_have_ended_does_not_start_anew() {
+        let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
+        let whole = at_once(times.wait(scan(180_000), 0, &times.sender())).expect("20 of 20 ms");
+        let gone = times.sender_at([127, 0, 0, 1].into());
+        drop(times.wait(scan(180_000), 0, &gone));
+        drop(gone);
+        let mut again = Some(times.wait(scan(180_000), 0, &times.sender_at([127, 0, 0, 1].into())));
+        let mut other = Some(times.wait(scan(180_000), 0, &times.sender_at([127, 0, 0, 2].into())));
+        drop(whole);
+        assert!(Waiting::time(&mut again).now_or_never().is_none());
+        assert!(Waiting::time(&mut other).now_or_never().is_some());
+    }
+
+    #[test]
+    fn a_sender_is_granted_its_turn_beside_new_ones_that_never_end() {
+        let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
+        let old = times.sender();
+        let whole = at_once(times.wait(scan(180_000), 0, &old)).expect("20 of 20 ms");
+        let mut of_old = Some(times.wait(scan(180_000), 0, &old));
+        let mut of_new = Some(times.wait(scan(80_000), 0, &times.sender()));
+        drop(whole);
+        let granted = (1..=10).find(|_| {
+            let next = Some(times.wait(scan(80_000), 0, &times.sender()));
+            drop(Waiting::time(&mut of_new).now_or_never());
+            of_new = next;
+            Waiting::time(&mut of_old).now_or_never().is_some()
+        });
+        assert!(granted.is_some(), "each new one has scans of 10 ms");
     }
 }

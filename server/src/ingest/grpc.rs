@@ -3,8 +3,10 @@
 //! A stream reads its next observation only while its events in flight are within the vehicle's limits and the peer
 //! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine
 //! returns the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as
-//! few reports as the transport can send.
+//! few reports as the transport can send. It runs in a task of its own, so that a peer that takes no reports keeps
+//! neither the engine's time nor an event.
 
+use std::error::Error;
 use std::net::Ipv4Addr;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -13,7 +15,7 @@ use std::time::Duration;
 use clearway_proto::v1;
 use futures::{Stream, stream};
 use prost::Message;
-use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
+use tokio::sync::mpsc::{self, UnboundedReceiver, channel, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
 use super::engine_time::{EngineTime, Sender, Waiting};
@@ -85,7 +87,9 @@ impl IngestService for Ingest {
         } else {
             stream.wait_for_time(first);
         }
-        Ok(Response::new(Box::pin(stream.reports())))
+        let (report_sender, mut reports) = channel(1);
+        tokio::spawn(stream.run(report_sender));
+        Ok(Response::new(Box::pin(stream::poll_fn(move |context| reports.poll_recv(context)))))
     }
 }
 
@@ -129,28 +133,33 @@ impl IngestStream {
         }
     }
 
-    fn reports(self) -> impl Stream<Item = Result<v1::IngestReport, Status>> {
-        stream::try_unfold(self, |mut stream| async move { Ok(stream.next().await?.map(|report| (report, stream))) })
-    }
-
-    /// Waits for the next report. `None` once everything is reported and no more observations will come.
-    async fn next(&mut self) -> Result<Option<v1::IngestReport>, Status> {
+    /// Reads observations and sends reports, until the peer hangs up, or everything is reported and no more observations
+    /// will come.
+    async fn run(mut self, reports: mpsc::Sender<Result<v1::IngestReport, Status>>) {
         loop {
             while let Ok((id, outcome)) = self.outcomes.try_recv() {
                 self.session.record_outcome(id.number, outcome);
             }
-            if let Some(report) = self.session.next_report() {
-                return Ok(Some(report));
-            }
-            if self.observations.is_none() && self.waiting.is_none() && self.session.is_idle() {
-                return self.end.take().map_or(Ok(None), Err);
+            let has_report = self.session.has_report();
+            if !has_report && self.observations.is_none() && self.waiting.is_none() && self.session.is_idle() {
+                if let Some(end) = self.end.take() {
+                    // An error means that the peer has hung up.
+                    let _ = reports.send(Err(end)).await;
+                }
+                return;
             }
             let (events_max, bytes_max) = (self.gateway.in_flight_max, self.gateway.limits.message_bytes_max);
-            let has_credit = self.waiting.is_none() && self.session.has_credit(events_max, bytes_max);
+            let has_credit = !has_report && self.waiting.is_none() && self.session.has_credit(events_max, bytes_max);
             tokio::select! {
                 // Outcomes first, because they give credit.
                 biased;
                 Some((id, outcome)) = self.outcomes.recv() => self.session.record_outcome(id.number, outcome),
+                () = reports.closed() => return,
+                Ok(place) = reports.reserve(), if has_report => {
+                    if let Some(report) = self.session.next_report() {
+                        place.send(Ok(report));
+                    }
+                }
                 () = self.gateways.stopped(), if self.observations.is_some() => {
                     self.stop_reading(Some(Status::unavailable("the server stops")));
                 }
@@ -202,9 +211,9 @@ impl Drop for IngestStream {
     }
 }
 
-/// True if the message was too long or not an observation, false for a failure of the network.
+/// True if the message was too long or not an observation, false for a failure of the network, which has a source.
 fn is_refusal(status: &Status) -> bool {
-    matches!(status.code(), Code::OutOfRange | Code::Internal)
+    matches!(status.code(), Code::OutOfRange | Code::Internal) && status.source().is_none()
 }
 
 async fn next_observation(

@@ -215,9 +215,14 @@ impl ClientSession {
         v1::IngestReport { acknowledged: self.acknowledged, refused: Vec::new(), client: self.client }
     }
 
+    /// True if anything is not reported yet.
+    pub fn has_report(&self) -> bool {
+        self.reported != Some(self.acknowledged) || !self.refused.is_empty()
+    }
+
     /// A report of everything that is not reported yet, if there is anything.
     pub fn next_report(&mut self) -> Option<v1::IngestReport> {
-        if self.reported == Some(self.acknowledged) && self.refused.is_empty() {
+        if !self.has_report() {
             return None;
         }
         self.reported = Some(self.acknowledged);

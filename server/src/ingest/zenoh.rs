@@ -36,6 +36,9 @@ const SAMPLES_MAX: usize = 256;
 /// Greatest number of sources of one vehicle. A new source replaces the one that was silent longest, of those without
 /// queued samples. Ours: the sensors of a vehicle seldom have more than one session each.
 const SOURCES_MAX: usize = 16;
+/// Part of the longest message's bytes that the queue of each source may have, however many bytes those of the others
+/// have. Ours: a scan of 125,000 points with all fields, a revolution of an HDL-64E, also beside fifteen sources.
+const OWN_PART: usize = 4;
 /// A source that has sent within this time is not replaced, if an observation of it was ever accepted. Ours: ten
 /// revolutions.
 const RECENT: Duration = Duration::from_secs(1);
@@ -134,8 +137,8 @@ impl Queues {
     }
 
     /// Queues a sample. False if it exceeds a bound: the samples of all sources together have at most the bytes of the
-    /// vehicle's longest message, and beyond them each source has an equal part of as many bytes. Of a sample that is
-    /// too long only the length is queued.
+    /// vehicle's longest message, and beyond them each source a quarter of as many. Of a sample that is too long only
+    /// the length is queued.
     fn push(&mut self, source: Option<ZenohId>, key: &str, payload: &ZBytes, now: Instant) -> bool {
         let bytes_max = self.gateway.limits.message_bytes_max;
         let of_vehicle = self.bytes.clone();
@@ -146,7 +149,7 @@ impl Queues {
         let queued = QueuedBytes::new(payload.len(), [queue.bytes.clone(), of_vehicle.clone()]);
         let samples = queue.samples.clone();
         let [own, all] = [&queue.bytes, &of_vehicle].map(|count| count.load(Ordering::Relaxed));
-        let fits = all <= bytes_max || own <= bytes_max / self.all.len();
+        let fits = all <= bytes_max || own <= bytes_max / OWN_PART;
         fits && samples.try_send(QueuedSample { key: key.to_owned(), payload, length, queued }).is_ok()
     }
 
@@ -206,7 +209,7 @@ mod tests {
         let large = ZBytes::from(vec![0; 40_000]);
         let flood: Vec<_> = (0..4).map(|_| queues.push(session(1), "scan/top", &large, now)).collect();
         assert_eq!(flood, [true, true, false, false]);
-        assert!(queues.push(session(2), "scan/top", &large, now));
+        assert!(queues.push(session(2), "scan/top", &ZBytes::from(vec![0; 24_000]), now));
         let small = ZBytes::from(vec![0; 10]);
         let samples = (0..300).filter(|_| queues.push(session(3), "pose", &small, now)).count();
         assert_eq!(samples, SAMPLES_MAX);
@@ -214,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn many_sources_together_are_bounded_and_each_has_an_equal_part() {
+    fn many_sources_together_are_bounded_and_each_has_a_part() {
         let (mut queues, mut opened) = queues(1000);
         let now = Instant::now();
         let small = ZBytes::from(vec![0; 1000]);
@@ -222,7 +225,7 @@ mod tests {
         assert!(!queues.push(session(1), "pose", &small, now), "a longest message has 97,536 bytes");
         for source in 2..=SOURCES_MAX {
             let queued = (0..100).filter(|_| queues.push(session(source as u8), "pose", &small, now)).count();
-            assert_eq!(queued, 97_536 / source / 1000, "of {source} sources");
+            assert_eq!(queued, 24, "a quarter of it for source {source}");
         }
         let too_long = ZBytes::from(vec![0; 1 << 20]);
         let mut sources: Vec<_> = std::iter::from_fn(|| opened.try_recv().ok()).collect();

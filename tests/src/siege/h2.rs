@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use clearway_proto::packed::pack;
 use clearway_proto::v1;
 use futures::FutureExt;
 use futures::future::join_all;
@@ -45,6 +46,7 @@ pub const ATTACKS: &[Attack] = &[
         name: "gRPC: 2,000 readers without credits or reading",
         run: |target| answer_pings(target.grpc, 20, 100).boxed(),
     },
+    Attack { name: "gRPC: packets behind a window of 0", run: |target| packets(target.grpc).boxed() },
     Attack { name: "gRPC: rapid reset", run: |target| flood(target.grpc, rapid_reset).boxed() },
     Attack { name: "gRPC: flood of CONTINUATION", run: |target| flood(target.grpc, continuations).boxed() },
     Attack { name: "gRPC: flood of empty DATA", run: |target| flood(target.grpc, empty_data).boxed() },
@@ -105,6 +107,33 @@ async fn answer_pings_of_one(at: SocketAddr, readers: u32) -> std::io::Result<()
         socket.write_all(&frame(kind::HEADERS, flag::END_HEADERS, stream, &request(WATCH))).await?;
         socket.write_all(&frame(kind::DATA, 0, stream, &wanted)).await?;
     }
+    answer(socket).await
+}
+
+/// Streams of ingest, each with as many packets as fit in one observation, whose reports are never taken.
+async fn packets(at: SocketAddr) {
+    let packets = v1::Packets { lengths: pack(&[1_u16; 1024]), ..Default::default() };
+    let body = Some(v1::observation::Body::Packets(packets));
+    let observation =
+        v1::Observation { number: 1, vehicle: "car".into(), sensor: "top".into(), body, ..Default::default() };
+    let observation = observation.encode_to_vec();
+    let observation = message(u32::try_from(observation.len()).expect("short"), &observation);
+    loop {
+        let _cut = async {
+            let mut socket = connect(at, 0).await?;
+            for stream in [1, 3, 5] {
+                socket.write_all(&frame(kind::HEADERS, flag::END_HEADERS, stream, &request(INGEST))).await?;
+                socket.write_all(&frame(kind::DATA, 0, stream, &observation)).await?;
+            }
+            answer(socket).await
+        }
+        .await;
+        tokio::time::sleep(AGAIN).await;
+    }
+}
+
+/// Answers pings and settings until the server ends the connection.
+async fn answer(mut socket: TcpStream) -> std::io::Result<()> {
     loop {
         let mut head = [0; 9];
         socket.read_exact(&mut head).await?;

@@ -4,6 +4,7 @@
 #[path = "../fixture/mod.rs"]
 mod fixture;
 mod refused;
+mod silent_peer;
 mod zenoh_flood;
 
 use std::collections::BTreeMap;
