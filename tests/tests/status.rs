@@ -140,6 +140,11 @@ async fn the_dashboard_and_the_alerts_use_metrics_that_a_server_has() {
         }
         assert!(used.len() >= 8, "{used:?}");
     }
+    // Without it Prometheus has no quantile.
+    let types = metrics.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.strip_suffix(" histogram"));
+    let is_of = |line: &str, name: &str| line.strip_prefix(name).is_some_and(|rest| rest.starts_with("_bucket{"));
+    let has_rest = |name: &str| metrics.lines().any(|line| is_of(line, name) && line.contains("le=\"+Inf\""));
+    assert!(types.clone().count() >= 2 && types.clone().all(has_rest), "{metrics}");
 }
 
 /// A running Prometheus with the configuration and the alerts of `deploy/prometheus`, faster by far.

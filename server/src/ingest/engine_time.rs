@@ -2,8 +2,8 @@
 //!
 //! Little waits in the queue of the engine, so that a packet that comes over UDP is not late behind it; the rest waits
 //! with its sender. The sender that will have had the least time is next (self-clocked fair queuing: Golestani, INFOCOM
-//! 1994), so that the scans of a sender that takes less than an equal part wait for one scan of the others, however many
-//! send more, and no sender waits for ever.
+//! 1994), so that the scans of a sender that takes less than an equal part wait for one scan of the others, however
+//! many send more, and no sender waits for ever.
 
 use std::collections::BTreeMap;
 use std::future::{pending, ready};
@@ -39,7 +39,8 @@ pub struct EngineTimes {
     /// Time for the points in the engine's queue.
     most_us: u64,
     turns: Arc<Mutex<Turns>>,
-    /// The hosts that have streams, and those that have had more time than one who always waits: they cannot start anew.
+    /// The hosts that have streams, and those that have had more time than one who always waits: a new stream of theirs
+    /// has had it too.
     hosts: Mutex<BTreeMap<IpAddr, Sender>>,
 }
 
@@ -283,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn a_host_whose_streams_have_ended_does_not_start_anew() {
+    fn a_host_whose_streams_have_ended_keeps_the_time_that_it_has_had() {
         let times = EngineTimes::new(Arc::default(), Duration::from_millis(20));
         let whole = at_once(times.wait(scan(180_000), 0, &times.sender())).expect("20 of 20 ms");
         let gone = times.sender_at([127, 0, 0, 1].into());

@@ -21,8 +21,8 @@ use crate::base::sync::locked;
 use crate::config::Vehicle;
 use crate::status::map_time::MapTime;
 
-/// Part of the longest time for a map that the points in the engine's queue may take, beside UDP's. Ours: three scans of
-/// an HDL-64E, so that the engine always has one while another is decoded, and a packet of UDP does not wait long.
+/// Part of the longest time for a map that the points in the engine's queue may take, beside UDP's. Ours: three scans
+/// of an HDL-64E, so that the engine always has one while another is decoded, and a packet of UDP does not wait long.
 const QUEUED_PART: u32 = 4;
 
 /// The gateway of one vehicle.

@@ -133,8 +133,8 @@ impl IngestStream {
         }
     }
 
-    /// Reads observations and sends reports, until the peer hangs up, or everything is reported and no more observations
-    /// will come.
+    /// Reads observations and sends reports, until the peer hangs up, or everything is reported and no more
+    /// observations will come.
     async fn run(mut self, reports: mpsc::Sender<Result<v1::IngestReport, Status>>) {
         loop {
             while let Ok((id, outcome)) = self.outcomes.try_recv() {

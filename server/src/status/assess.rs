@@ -117,6 +117,7 @@ impl VehicleStatus {
         changing.window.push_counts(up, counts);
         let since_mapped = up.saturating_sub(changing.mapped_at);
         let by_clock = now_ns().saturating_sub(changing.newest_capture_end_ns);
+        let map_ahead = Duration::from_nanos(u64::try_from(by_clock.saturating_neg()).unwrap_or(0));
         let by_clock = Duration::from_nanos(u64::try_from(by_clock).unwrap_or(0));
         // As in a client: no step of a clock makes an old map look young.
         let age = if changing.has_recorded_stamps { since_mapped } else { by_clock.max(since_mapped) };
@@ -125,6 +126,8 @@ impl VehicleStatus {
             up,
             makes_maps: !self.layers.is_empty(),
             map_age: (changing.maps > 0).then_some(age),
+            map_ahead: if changing.has_recorded_stamps { Duration::ZERO } else { map_ahead },
+            not_fresh_for: up.saturating_sub(changing.fresh_at),
             validity: changing.validity,
             has_recorded_stamps: changing.has_recorded_stamps,
             replay: changing.replay.map(|(phase, at)| (phase, up.saturating_sub(at))),

@@ -61,6 +61,10 @@ pub struct Facts {
     pub makes_maps: bool,
     /// Age of the newest map; `None` before the first.
     pub map_age: Option<Duration>,
+    /// Time by which the capture of the newest map is ahead of the server's clock.
+    pub map_ahead: Duration,
+    /// Time since the newest map that was fresh when it was published.
+    pub not_fresh_for: Duration,
     /// Age at which a map is stale.
     pub validity: Duration,
     /// True if the maps carry the stamps of a recording, so that their age is not counted by the server's clock.
@@ -250,12 +254,15 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
     if facts.has_recorded_stamps {
         add(State::Warn, "maps are replayed with the stamps of the recording: readers call them stale".to_owned());
     }
+    // A replay that stands still does what it was asked to do.
+    let is_long = !stands && age.max(facts.not_fresh_for) > facts.validity + STALE_ERROR_AFTER;
+    let state = if is_long { State::Error } else { State::Warn };
     // A map with the stamp of the recording does not age while the replay stands still.
     if age > facts.validity && (expects_data(facts) || !facts.has_recorded_stamps) {
-        // A replay that stands still does what it was asked to do.
-        let is_long = !stands && age > facts.validity + STALE_ERROR_AFTER;
-        let state = if is_long { State::Error } else { State::Warn };
         add(state, format!("the newest map is {} old, and valid for {}", seconds(age), seconds(facts.validity)));
+    } else if facts.map_ahead > facts.validity {
+        let ahead = seconds(facts.map_ahead);
+        add(state, format!("the stamps are {ahead} ahead of this server's clock: readers call the maps stale"));
     }
 }
 
@@ -340,7 +347,7 @@ mod tests {
     #[test]
     fn each_thing_that_is_wrong_has_its_words() {
         type Change = fn(&mut Facts);
-        let cases: [(&str, &str, Change); 17] = [
+        let cases: [(&str, &str, Change); 19] = [
             ("error", "the engine has hung for 4 s", |f| f.fault = Some("the engine has hung for 4 s".into())),
             ("warn", "no packets from rear for 76 s", |f| f.sensors[1].silent = Some(ms(76_000))),
             ("warn", "no packets from rear since the server started 60 s ago", |f| f.sensors[1].silent = None),
@@ -350,6 +357,12 @@ mod tests {
             ("error", "no map yet", |f| f.map_age = None),
             ("warn", "the newest map is 0.4 s old, and valid for 0.3 s", |f| f.map_age = Some(ms(400))),
             ("error", "the newest map is 1.4 s old, and valid for 0.3 s", |f| f.map_age = Some(ms(1400))),
+            ("error", "the newest map is 0.4 s old, and valid for 0.3 s", |f| {
+                (f.map_age, f.not_fresh_for) = (Some(ms(400)), ms(1400));
+            }),
+            ("error", "the stamps are 6.0 s ahead of this server's clock: readers call the maps stale", |f| {
+                (f.map_ahead, f.not_fresh_for) = (ms(6000), ms(1400));
+            }),
             ("warn", "maps are replayed with the stamps of the recording: readers call them stale", |f| {
                 f.has_recorded_stamps = true;
             }),

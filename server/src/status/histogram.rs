@@ -36,7 +36,7 @@ impl Histogram {
 
     /// The upper bound of each bucket and the number of durations in it alone.
     pub fn buckets(&self) -> Vec<(f64, u64)> {
-        BOUNDS_S.into_iter().chain([f64::MAX]).zip(self.counts).collect()
+        BOUNDS_S.into_iter().chain([f64::INFINITY]).zip(self.counts).collect()
     }
 }
 
@@ -49,7 +49,7 @@ mod tests {
         let mut histogram = Histogram::default();
         [0.5, 1.0, 99.0, 70_000.0].iter().for_each(|ms| histogram.observe(Duration::from_secs_f64(ms / 1e3)));
         let full: Vec<_> = histogram.buckets().into_iter().filter(|(_, count)| *count > 0).collect();
-        assert_eq!(full, [(0.0005, 1), (0.001, 1), (0.1, 1), (f64::MAX, 1)]);
+        assert_eq!(full, [(0.0005, 1), (0.001, 1), (0.1, 1), (f64::INFINITY, 1)]);
         assert_eq!((histogram.count(), histogram.sum_s()), (4, 70.1005));
     }
 }

@@ -13,6 +13,7 @@ use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
+use crate::base::clock::now_ns;
 use crate::base::sync::locked;
 use crate::encode::EncodedMap;
 use crate::engine::acknowledgements::Acknowledgements;
@@ -102,6 +103,8 @@ pub(super) struct Changing {
     pub(super) newest_capture_end_ns: i64,
     /// Publication of the newest map, after `started`.
     pub(super) mapped_at: Duration,
+    /// Publication of the newest map that was fresh then, after `started`.
+    pub(super) fresh_at: Duration,
     pub(super) validity: Duration,
     pub(super) speed_m_s: Option<f64>,
     pub(super) has_recorded_stamps: bool,
@@ -388,12 +391,12 @@ impl VehicleStatus {
         state.states = states;
         // A jump of a replay sets the number back.
         state.maps = map.sequence + 1;
-        state.newest_capture_end_ns = map.capture_end_ns;
-        state.drivable_share = map.drivable_share;
-        state.mapped_at = self.started.elapsed();
-        (state.validity, state.speed_m_s) = (validity, speed_m_s);
+        (state.newest_capture_end_ns, state.drivable_share) = (map.capture_end_ns, map.drivable_share);
+        let at = self.started.elapsed();
+        (state.mapped_at, state.validity, state.speed_m_s) = (at, validity, speed_m_s);
         state.has_recorded_stamps = !is_shifted && self.is_from_files.load(Ordering::Relaxed);
-        let at = state.mapped_at;
+        let age = Duration::from_nanos(now_ns().abs_diff(map.capture_end_ns));
+        state.fresh_at = if state.has_recorded_stamps || age <= validity { at } else { state.fresh_at };
         state.window.push_map(at, stages, map.bytes());
         for (histogram, time) in state.stages.iter_mut().zip(stages) {
             time.into_iter().for_each(|time| histogram.observe(time));

@@ -53,8 +53,8 @@ pub struct Options {
 /// Sends the observations.
 ///
 /// # Errors
-/// If a file cannot be read, or as [`ClientError`](clearway_client::ClientError). A refused observation is not an
-/// error; the output says so.
+/// If a file cannot be read, if everything was refused, or as [`ClientError`](clearway_client::ClientError). A refused
+/// observation beside accepted ones is not an error; the output says so.
 pub fn run(options: &Options) -> Result<()> {
     block_on(ingest(options))
 }
@@ -73,17 +73,22 @@ async fn ingest(options: &Options) -> Result<()> {
         Sender { ingester, paced: !options.fast, started: None, sent: BTreeMap::new(), refusals: Vec::new() };
     for (stamp_ns, item) in &plan.items {
         let (kind, observation) = item.read(&options.sensor, *stamp_ns)?;
-        sender.send(kind, *stamp_ns, observation).await?;
+        sender.send(kind, 1, *stamp_ns, observation).await?;
     }
     for file in &plan.drives {
         for chunk in files::chunks(file)? {
             let packets = chunk.with_context(|| file.display().to_string())?;
             let stamp_ns = packets.last().map_or(0, |(stamp_ns, _)| *stamp_ns);
-            sender.send("packets", stamp_ns, Observation::packets(&options.sensor, &packets)).await?;
+            let observation = Observation::packets(&options.sensor, &packets);
+            sender.send("packets", packets.len() as u64, stamp_ns, observation).await?;
         }
     }
     sender.refusals.extend(sender.ingester.settled().await?);
-    report(&sender, &plan.notes, options.json)
+    report(&sender, &plan.notes, options.json)?;
+    match sender.is_all_refused() {
+        true => bail!("nothing was accepted"),
+        false => Ok(()),
+    }
 }
 
 #[cfg(feature = "zenoh")]
@@ -103,13 +108,13 @@ struct Sender {
     paced: bool,
     /// When the first observation was sent, and its stamp.
     started: Option<(Instant, i64)>,
-    /// Number of observations sent, by kind.
+    /// Number of scans, poses, roads and packets sent, by kind.
     sent: BTreeMap<&'static str, u64>,
     refusals: Vec<Refusal>,
 }
 
 impl Sender {
-    async fn send(&mut self, kind: &'static str, stamp_ns: i64, observation: Observation) -> Result<()> {
+    async fn send(&mut self, kind: &'static str, count: u64, stamp_ns: i64, observation: Observation) -> Result<()> {
         let (started, first_ns) = *self.started.get_or_insert((Instant::now(), stamp_ns));
         if self.paced {
             let due = Duration::from_nanos(u64::try_from(stamp_ns.saturating_sub(first_ns)).unwrap_or(0));
@@ -121,9 +126,15 @@ impl Sender {
             }
             bail!(error);
         }
-        *self.sent.entry(kind).or_default() += 1;
+        *self.sent.entry(kind).or_default() += count;
         self.refusals.extend(self.ingester.refusals());
         Ok(())
+    }
+
+    /// True if all that was sent was refused.
+    fn is_all_refused(&self) -> bool {
+        let [sent, refused] = [self.sent.values().sum::<u64>(), self.refusals.iter().map(|of| of.count).sum()];
+        sent > 0 && refused >= sent
     }
 }
 
@@ -135,7 +146,7 @@ fn report(sender: &Sender, notes: &[String], as_json: bool) -> Result<()> {
     }
     let sent = sender.sent.iter().map(|(kind, count)| counted(*count, kind.trim_end_matches('s')));
     let sent: Vec<String> = sent.collect();
-    print_line(&format!("sent {}; all of them were acknowledged", sent.join(", ")))?;
+    print_line(&format!("sent {}; the outcome of each is known", sent.join(", ")))?;
     for (reason, count) in &reasons {
         let first = sender.refusals.iter().find(|refusal| refusal.reason == **reason);
         print_line(&format!("refused {count}: {reason}: {}", first.map_or("", |refusal| &refusal.message)))?;
