@@ -5,8 +5,8 @@
 //! Columns: a healthy gRPC reader of all layers: the 99th percentile and worst age of its maps, the maps it missed, and
 //! how often its stream broke; the same of a healthy zenoh reader of one layer, with the messages it passed over; the
 //! scans of ten a second that a healthy zenoh sender lost; the time until a new gRPC client has its first map (`-`:
-//! none in 5 s); the server's resident memory before, at most during, and 5 s after; the processor time that it used, in
-//! percent of one core. TCP attacks come from 127.0.0.2, the honest peers from 127.0.0.1: limits are by address. The
+//! none in 5 s); the server's resident memory before, at most during, and 5 s after; the processor time that it used,
+//! in percent of one core. TCP attacks come from 127.0.0.2, the honest peers from 127.0.0.1: limits are by address. The
 //! attackers get only processor time that no other process wants, as if they ran on another machine.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
