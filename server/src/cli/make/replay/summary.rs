@@ -146,11 +146,12 @@ impl Summary {
         }
     }
 
-    /// True if something was received, and all of it was refused.
+    /// True if something was received, and all of it but telemetry was refused.
     pub fn is_all_refused(&self) -> bool {
         let others = self.others.iter().map(|(_, snapshot)| snapshot);
         let mut ledgers = std::iter::once(&self.snapshot).chain(others).map(|snapshot| &snapshot.ledger);
-        self.received() > 0 && ledgers.all(|ledger| ledger.received == ledger.refused.values().sum::<u64>())
+        self.received() > 0
+            && ledgers.all(|ledger| ledger.received == ledger.telemetry + ledger.refused.values().sum::<u64>())
     }
 
     /// The summary as a few lines of text.
