@@ -39,8 +39,8 @@ pub struct EngineTimes {
     /// Time for the points in the engine's queue.
     most_us: u64,
     turns: Arc<Mutex<Turns>>,
-    /// The hosts that have streams, and those that have had more time than one who always waits: a new stream of theirs
-    /// has had it too.
+    /// The hosts that have streams, and those that have had more time than a sender that always waits: a new stream of
+    /// theirs has had it too.
     hosts: Mutex<BTreeMap<IpAddr, Sender>>,
 }
 
@@ -62,7 +62,7 @@ pub struct Waiting {
 #[derive(Debug)]
 struct Turns {
     free: u64,
-    /// The time that a sender has had who always waits: that of the sender of the newest turn, with it.
+    /// The time that a sender that always waits has had: that of the sender of the newest turn, with it.
     now: u64,
     /// In the order in which they came.
     waiting: Vec<Turn>,
@@ -85,17 +85,17 @@ impl EngineTimes {
         Self { map_time, most_us, turns: Arc::new(Mutex::new(turns)), hosts: Mutex::default() }
     }
 
-    /// A sender that has had as much time as one who always waits.
+    /// A sender that has had as much time as a sender that always waits.
     pub fn sender(&self) -> Sender {
-        Sender(Arc::new(locked(&self.turns).now.into()))
+        locked(&self.turns).sender()
     }
 
     /// The sender of all streams of this host.
     pub fn sender_at(&self, host: IpAddr) -> Sender {
         let mut hosts = locked(&self.hosts);
-        let now = locked(&self.turns).now;
-        hosts.retain(|_, Sender(had)| Arc::strong_count(had) > 1 || had.load(Ordering::Relaxed) > now);
-        hosts.entry(host).or_insert_with(|| self.sender()).clone()
+        let turns = locked(&self.turns);
+        hosts.retain(|_, Sender(had)| Arc::strong_count(had) > 1 || had.load(Ordering::Relaxed) > turns.now);
+        hosts.entry(host).or_insert_with(|| turns.sender()).clone()
     }
 
     /// An observation of `bytes` bytes that waits until the points before it leave the engine time for it, so that no
@@ -129,6 +129,10 @@ impl EngineTimes {
 }
 
 impl Turns {
+    fn sender(&self) -> Sender {
+        Sender(Arc::new(self.now.into()))
+    }
+
     /// Grants the turns for which there is time. One that needs more than is free is not passed by another.
     fn grant(&mut self, turns: &Arc<Mutex<Self>>) {
         self.waiting.retain(|turn| !turn.granted.is_closed());

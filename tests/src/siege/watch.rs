@@ -105,7 +105,9 @@ async fn read(target: &Target, over_zenoh: bool, seen: &Mutex<Seen>, stop: &Atom
 
 /// A sender over zenoh of ten scans a second of a plain, in a thread and a runtime of its own.
 pub struct Sender {
-    lost: Arc<AtomicU64>,
+    /// Scans that were sent and not refused, since the last [`Sender::take`].
+    accepted: Arc<AtomicU64>,
+    since: Mutex<Instant>,
     stop: Arc<AtomicBool>,
     thread: JoinHandle<()>,
 }
@@ -113,21 +115,28 @@ pub struct Sender {
 impl Sender {
     /// Starts to send the scans of the sensor `side`.
     pub fn start(target: &Target) -> Self {
-        let (lost, stop, target) = (Arc::<AtomicU64>::default(), Arc::<AtomicBool>::default(), target.clone());
+        let (accepted, stop, target) = (Arc::<AtomicU64>::default(), Arc::<AtomicBool>::default(), target.clone());
         let thread = std::thread::spawn({
-            let (lost, stop) = (lost.clone(), stop.clone());
+            let (accepted, stop) = (accepted.clone(), stop.clone());
             move || {
                 let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
-                let sent = runtime.expect("a runtime").block_on(send(&target, &lost, &stop));
-                sent.expect("the server accepts a sender");
+                runtime.expect("a runtime").block_on(async {
+                    while !stop.load(Ordering::Relaxed) {
+                        let _ended = send(&target, &accepted, &stop).await;
+                    }
+                });
             }
         });
-        Self { lost, stop, thread }
+        Self { accepted, since: Mutex::new(Instant::now()), stop, thread }
     }
 
-    /// Scans since the last call that were refused, or not sent because those before them were not acknowledged.
+    /// Scans that were due since the last call and were refused, or not sent because too many before them were not
+    /// acknowledged.
     pub fn take(&self) -> u64 {
-        self.lost.swap(0, Ordering::Relaxed)
+        let since = std::mem::replace(&mut *self.since.lock().expect("the siege does not panic"), Instant::now());
+        // One may be due at this moment.
+        let due = (since.elapsed().as_millis() / SCAN_PERIOD.as_millis()).saturating_sub(1) as u64;
+        due.saturating_sub(self.accepted.swap(0, Ordering::Relaxed))
     }
 
     /// Ends it.
@@ -137,18 +146,21 @@ impl Sender {
     }
 }
 
-async fn send(target: &Target, lost: &AtomicU64, stop: &AtomicBool) -> Result<(), ClientError> {
+async fn send(target: &Target, accepted: &AtomicU64, stop: &AtomicBool) -> Result<(), ClientError> {
     let mut ingester = ZenohClient::connect(&target.zenoh).await?.ingest("car").await?;
     let [x, y, z] = plain(20_000);
     let mut due = tokio::time::interval(SCAN_PERIOD);
     due.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+    // Refusals are known later than their scans were sent.
+    let mut refused = 0;
     while !stop.load(Ordering::Relaxed) {
         due.tick().await;
-        let began = Instant::now();
         ingester.send(Observation::scan("side", now_ns(), &x, &y, &z)).await?;
-        let not_sent = began.elapsed().as_millis() / SCAN_PERIOD.as_millis();
-        let refused = ingester.refusals().len();
-        lost.fetch_add(not_sent as u64 + refused as u64, Ordering::Relaxed);
+        refused += ingester.refusals().len();
+        match refused {
+            0 => _ = accepted.fetch_add(1, Ordering::Relaxed),
+            _ => refused -= 1,
+        }
     }
     Ok(())
 }
