@@ -16,6 +16,9 @@ mod space;
 #[cfg(clearway_browser)]
 mod webdriver;
 
+#[cfg(clearway_browser)]
+use std::sync::{Mutex, PoisonError};
+
 macro_rules! in_a_browser {
     ($($name:ident => $test:path),* $(,)?) => { $(
         #[test]
@@ -25,9 +28,18 @@ macro_rules! in_a_browser {
         )]
         fn $name() {
             #[cfg(clearway_browser)]
-            $test();
+            one_at_a_time($test);
         }
     )* };
+}
+
+/// Runs a test while no other runs: a browser without a graphics card draws with all processors, and beside a second
+/// one it would answer a click after minutes.
+#[cfg(clearway_browser)]
+fn one_at_a_time(test: fn()) {
+    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+    let _mine = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+    test();
 }
 
 in_a_browser! {
