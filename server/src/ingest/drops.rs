@@ -1,4 +1,5 @@
 //! Counts of the readings that did not become events: by cause, by unknown sender, by the reason of a refused message.
+//! Beside them, what else is known of a vehicle's inputs.
 //! The event queue reports the counts to the engine as [`Body::Lost`](clearway_mapping::event::Body::Lost); until then
 //! the status adds them to the ledger.
 
@@ -9,6 +10,7 @@ use std::sync::Mutex;
 use clearway_mapping::event::Cause;
 use clearway_mapping::ledger::Ledger;
 
+use super::sensor_senders::SensorSenders;
 use crate::base::sync::locked;
 
 /// Number of unknown senders that are remembered. Ours: enough to find a sensor with a wrong address.
@@ -22,6 +24,8 @@ pub struct DropCounters {
     unknown_senders: Mutex<VecDeque<UnknownSender>>,
     /// Refused messages by reason; the ledger counts all of them as `observation`.
     refused_messages: Mutex<BTreeMap<&'static str, u64>>,
+    /// Who sends the data of each sensor.
+    pub senders: SensorSenders,
     /// Threads that read for the vehicle and ended by a fault.
     ended_inputs: Mutex<Vec<String>>,
 }

@@ -3,8 +3,9 @@
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
@@ -37,6 +38,8 @@ pub struct Gateway {
     pub in_flight_max: usize,
     sensors: Mutex<Sensors>,
     streams: StreamPlaces,
+    /// Number of streams that have been named.
+    named_streams: AtomicU64,
     /// The engine's time for the observations.
     pub time: EngineTimes,
     map_time: Arc<MapTime>,
@@ -96,6 +99,7 @@ impl Gateway {
                 newest_scans: BTreeMap::new(),
             }),
             streams: StreamPlaces::new(streams_max, (streams_max / 4).max(1)),
+            named_streams: AtomicU64::new(0),
             time: EngineTimes::new(map_time.clone(), map_time_max / QUEUED_PART),
             map_time,
             map_time_max,
@@ -109,6 +113,11 @@ impl Gateway {
     /// [`StreamLimitError`] if there is none for this sender.
     pub fn take_stream(&self, sender: IpAddr) -> Result<StreamPlace, StreamLimitError> {
         self.streams.take(sender)
+    }
+
+    /// A name for a new stream of a host, which no other stream has.
+    pub fn name_stream(&self, host: IpAddr) -> String {
+        format!("stream {} of {host}", self.named_streams.fetch_add(1, Ordering::Relaxed) + 1)
     }
 
     /// Checks one observation of `bytes` bytes and pushes its events; the last one holds `time` until it is processed.
@@ -159,11 +168,14 @@ impl Gateway {
                     Err(unknown) => return refuse(unknown, session),
                 };
                 session.begin(number, bodies.len(), bytes);
-                let last = bodies.len().saturating_sub(1);
+                let (last, now) = (bodies.len().saturating_sub(1), Instant::now());
                 for (at, (captured_ns, body)) in bodies.into_iter().enumerate() {
                     let id = ObservationId { client, number };
                     let time = if at == last { std::mem::take(&mut time) } else { EngineTime::default() };
                     let receipt = Receipt::new(id, time, outcomes);
+                    if let Some(sender) = session.sender() {
+                        self.queue.drops().senders.note(source, &body, sender, now);
+                    }
                     match body {
                         Body::Sensor(sensor) => {
                             self.push_declaration(captured_ns, sensor, receipt, &mut sensors, session);
@@ -345,8 +357,6 @@ mod tests {
     use clearway_proto::packed::pack;
     use futures::FutureExt;
     use tokio::sync::mpsc::unbounded_channel;
-
-    use std::sync::atomic::Ordering;
 
     use super::*;
     use crate::base::clock::Clock;

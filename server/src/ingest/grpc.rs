@@ -81,7 +81,8 @@ impl IngestService for Ingest {
         let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
         drop(unnamed);
         let sender = gateway.time.sender_at(host);
-        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), sender, place);
+        let session = ClientSession::of_sender(0, &gateway.name_stream(host));
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), sender, session, place);
         if first.body.is_none() {
             stream.acknowledge_opening(&first);
         } else {
@@ -116,6 +117,7 @@ impl IngestStream {
         gateway: Arc<Gateway>,
         gateways: Gateways,
         sender: Sender,
+        session: ClientSession,
         place: StreamPlace,
     ) -> Self {
         let (outcome_sender, outcomes) = unbounded_channel();
@@ -125,7 +127,7 @@ impl IngestStream {
             sender,
             gateway,
             gateways,
-            session: ClientSession::new(0),
+            session,
             outcome_sender,
             outcomes,
             end: None,

@@ -14,6 +14,7 @@
 //! | [`ros`] | ROS 2 messages, live or from a file -> readings |
 //! | [`files`] | captures, MCAP files, scans -> readings |
 //! | [`queue`] | readings -> numbered events on one bounded queue a vehicle |
+//! | [`sensor_senders`] | who sends the data of each sensor, to tell when several do at once |
 //! | [`drops`] | counts of readings that did not become events |
 
 pub mod drops;
@@ -25,6 +26,7 @@ pub mod observation;
 pub mod queue;
 pub mod receipt;
 pub mod ros;
+pub mod sensor_senders;
 pub mod stream_places;
 pub mod udp;
 #[cfg(feature = "zenoh")]

@@ -8,6 +8,7 @@ use clearway_proto::v1;
 use tokio::sync::mpsc::UnboundedSender;
 
 use super::engine_time::EngineTime;
+use super::sensor_senders::SensorSender;
 
 /// The outcome of one event.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -93,6 +94,8 @@ pub struct NumberError {
 #[derive(Debug, Default)]
 pub struct ClientSession {
     client: u64,
+    /// What names the client alone; `None` if it need not be told from others.
+    sender: Option<SensorSender>,
     /// Greatest number received.
     newest: Option<u64>,
     in_flight: VecDeque<InFlight>,
@@ -119,6 +122,16 @@ impl ClientSession {
     /// The session of a client that has sent nothing yet.
     pub fn new(client: u64) -> Self {
         Self { client, ..Self::default() }
+    }
+
+    /// The session of a client that is told from others by this name.
+    pub fn of_sender(client: u64, name: &str) -> Self {
+        Self { client, sender: Some(SensorSender::Named(name.into())), ..Self::default() }
+    }
+
+    /// The client as a sender of data of sensors.
+    pub fn sender(&self) -> Option<&SensorSender> {
+        self.sender.as_ref()
     }
 
     /// Remembers that the client has declared this sensor; false if it had done so before.

@@ -92,7 +92,7 @@ impl Source {
         is_accepted: Arc<AtomicBool>,
         sender: Sender,
     ) -> Self {
-        let (clients, waiting, waiting_bytes) = (Clients::default(), None, None);
+        let (clients, waiting, waiting_bytes) = (Clients { of: id, ..Clients::default() }, None, None);
         Self { id, samples, sources, is_accepted, sender, clients, waiting, waiting_bytes }
     }
 
@@ -218,6 +218,8 @@ fn sensor_of_key<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Opti
 /// The remembered clients of one source, ordered from the longest silent to the most recent.
 #[derive(Default)]
 struct Clients {
+    /// The source.
+    of: Option<ZenohId>,
     all: Vec<Client>,
     /// The sessions of clients that have ended since they were last taken.
     forgotten: Vec<ClientSession>,
@@ -245,7 +247,9 @@ impl Clients {
                 if let Some(idle) = self.longest_idle().filter(|_| is_full) {
                     self.forget(idle);
                 }
-                Client { heard: Instant::now(), id, session: ClientSession::new(id), repetitions: 0, is_due: false }
+                let of = self.of.map_or_else(|| "without a name".to_owned(), |of| of.to_string());
+                let session = ClientSession::of_sender(id, &format!("client {id} of zenoh session {of}"));
+                Client { heard: Instant::now(), id, session, repetitions: 0, is_due: false }
             }
         };
         let client = self.all.push_mut(client);

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use clearway_mapping::pipeline::NamedStatus;
 use futures::future::select_all;
 use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
@@ -121,6 +122,10 @@ impl VehicleStatus {
         let by_clock = Duration::from_nanos(u64::try_from(by_clock).unwrap_or(0));
         // As in a client: no step of a clock makes an old map look young.
         let age = if changing.has_recorded_stamps { since_mapped } else { by_clock.max(since_mapped) };
+        let senders = |source| self.drops.senders.at_once(source, Instant::now());
+        let of_sensors =
+            changing.sensors.iter().map(|sensor| sensor_facts(sensor, senders(sensor.source), &changing, up));
+        let sensors = of_sensors.collect();
         Facts {
             fault: self.fault(),
             up,
@@ -132,7 +137,7 @@ impl VehicleStatus {
             has_recorded_stamps: changing.has_recorded_stamps,
             replay: changing.replay.map(|(phase, at)| (phase, up.saturating_sub(at))),
             replay_awaited: changing.replay_awaited.clone(),
-            sensors: changing.sensors.iter().map(|sensor| sensor_facts(sensor, &changing, up)).collect(),
+            sensors,
             loss,
             recorder_problem: self.recorder_problem(),
             store_problem: self.recorder.get().and_then(|counts| counts.store_problem()),
@@ -155,7 +160,7 @@ impl VehicleStatus {
     }
 }
 
-fn sensor_facts(sensor: &clearway_mapping::pipeline::NamedStatus, changing: &Changing, up: Duration) -> SensorFacts {
+fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing, up: Duration) -> SensorFacts {
     let seen = changing.seen.get(&sensor.name).copied().unwrap_or_default();
     let since = |at: Option<Duration>| at.map(|at| up.saturating_sub(at));
     let silent = since(seen.read_at);
@@ -170,6 +175,7 @@ fn sensor_facts(sensor: &clearway_mapping::pipeline::NamedStatus, changing: &Cha
         completeness: state.filter(|_| left_out != "silent").map(|state| state.completeness),
         clock: sensor.status.clock.map_or("", |clock| clock.as_str()).to_owned(),
         clock_offset_ms: sensor.status.clock_offset_ms,
+        senders,
         blocked_deg: sensor.status.blocked.sectors.iter().map(|s| f64::from(s.to_deg) - f64::from(s.from_deg)).sum(),
         mount: sensor
             .mount

@@ -104,6 +104,8 @@ pub struct SensorFacts {
     pub clock: String,
     /// Time by which the host's clock is ahead of the sensor's, in ms.
     pub clock_offset_ms: i64,
+    /// The senders that send its data at once, if there are several.
+    pub senders: Vec<String>,
     /// Width of the sectors that have lost their returns, in degrees.
     pub blocked_deg: f64,
     /// Height (m), pitch and roll (degrees) by which the ground contradicts the configured mount, if it does.
@@ -282,6 +284,10 @@ fn sensor_findings(sensor: &SensorFacts, add: &mut impl FnMut(State, String)) {
     if is_silent {
         return;
     }
+    if !sensor.senders.is_empty() {
+        let senders = sensor.senders.join(", ");
+        add(State::Warn, format!("several send the data of {name}, each in place of the others': {senders}"));
+    }
     if !sensor.left_out.is_empty() {
         add(State::Warn, format!("{name} is left out of the newest map: its scan is {}", sensor.left_out));
     }
@@ -347,7 +353,7 @@ mod tests {
     #[test]
     fn each_thing_that_is_wrong_has_its_words() {
         type Change = fn(&mut Facts);
-        let cases: [(&str, &str, Change); 19] = [
+        let cases: [(&str, &str, Change); 20] = [
             ("error", "the engine has hung for 4 s", |f| f.fault = Some("the engine has hung for 4 s".into())),
             ("warn", "no packets from rear for 76 s", |f| f.sensors[1].silent = Some(ms(76_000))),
             ("warn", "no packets from rear since the server started 60 s ago", |f| f.sensors[1].silent = None),
@@ -375,6 +381,9 @@ mod tests {
                  deg in roll",
                 |f| f.sensors[0].mount = Some([-0.2, -2.0, 0.0]),
             ),
+            ("warn", "several send the data of top, each in place of the others': a, b", |f| {
+                f.sensors[0].senders = vec!["a".into(), "b".into()];
+            }),
             ("warn", "rear is left out of the newest map: its scan is late", |f| f.sensors[1].left_out = "late".into()),
             ("warn", "top covers 72 % of its revolution", |f| f.sensors[0].completeness = Some(0.72)),
             ("warn", "the clock of top is holdover", |f| f.sensors[0].clock = "holdover".into()),

@@ -7,6 +7,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
 use clearway_mapping::event::Cause;
 use clearway_ros::{Frames, Kind};
@@ -19,6 +20,7 @@ use super::decoder::{PoseSource, TopicDecoder};
 use crate::base::sync::locked;
 use crate::config::Ros;
 use crate::ingest::queue::EventQueue;
+use crate::ingest::sensor_senders::SensorSender;
 use crate::zenoh_session::ZenohError;
 
 /// Greatest number of publishers whose sequences are checked; messages of further publishers are accepted unchecked.
@@ -106,7 +108,10 @@ fn key(domain: u32, topic: &str) -> String {
 impl SampleReceiver {
     /// Decodes one sample and pushes its readings, or counts the refusal. Never waits for the engine.
     fn push(&mut self, topic: &str, sample: &Sample) {
-        let lost = sample.attachment().map_or(0, |attachment| self.lost_before(&attachment.to_bytes()));
+        let numbered = sample.attachment().and_then(|attachment| decode_attachment(&attachment.to_bytes()));
+        let lost = numbered.map_or(0, |(sequence, publisher)| self.lost_before(sequence, publisher));
+        let name_of = |(_, publisher)| format!("ROS publisher {:032x}", u128::from_be_bytes(publisher));
+        let sender = numbered.map(name_of).map(|name| SensorSender::Named(name.into()));
         self.queue.record_drop(self.decoder.source(topic), Cause::Queue, lost);
         let name = sample.key_expr().as_str().rsplit('/').nth(1).unwrap_or_default();
         let Some(kind) = Kind::from_name(name) else {
@@ -119,7 +124,11 @@ impl SampleReceiver {
             tracing::info!(vehicle = %self.vehicle, topic, %error, "ros: refused");
             return self.record_refusal(topic, error.reason());
         }
+        let now = Instant::now();
         for reading in readings {
+            if let Some(sender) = &sender {
+                self.queue.drops().senders.note(reading.source, &reading.body, sender, now);
+            }
             if self.queue.push(reading.source, reading.body).is_err() {
                 return;
             }
@@ -130,9 +139,8 @@ impl SampleReceiver {
         self.queue.drops().record_refused_messages(self.decoder.source(topic), reason, 1);
     }
 
-    /// Number of messages of the same publisher that were lost before the message with this attachment.
-    fn lost_before(&mut self, attachment: &[u8]) -> u64 {
-        let Some((sequence, publisher)) = decode_attachment(attachment) else { return 0 };
+    /// Number of messages of the same publisher that were lost before this one.
+    fn lost_before(&mut self, sequence: i64, publisher: [u8; 16]) -> u64 {
         if self.sequences.len() >= PUBLISHERS_MAX && !self.sequences.contains_key(&publisher) {
             return 0;
         }

@@ -15,6 +15,7 @@ use std::os::fd::AsFd;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
 use nix::net::if_::if_nametoindex;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
@@ -23,6 +24,7 @@ use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 use crate::base::held_sockets::HeldSockets;
 use crate::config::{Listener, Vehicle, listeners};
 use crate::ingest::queue::{EventQueue, QueueClosedError};
+use crate::ingest::sensor_senders::SensorSender;
 
 mod receive;
 
@@ -226,9 +228,9 @@ fn receive(
             // The error concerns one datagram (an ICMP reply, for example), not the socket.
             Err(error) => tracing::warn!(at = %listener.at, %error, "udp receive"),
         }
-        let read = datagrams.len();
+        let (read, now) = (datagrams.len(), Instant::now());
         for datagram in datagrams.drain(..) {
-            route(datagram, listener, &mut batches);
+            route(datagram, listener, &mut batches, now);
         }
         batches.retain_mut(|batch| batch.push().is_ok());
         if batches.is_empty() {
@@ -264,8 +266,9 @@ impl VehicleBatch<'_> {
 
 /// Adds a datagram to the batch of its vehicle. The first vehicle of the socket counts a datagram of an unknown sender
 /// or without sender, so that exactly one ledger has each datagram.
-fn route(datagram: Received, listener: &Listener, batches: &mut [VehicleBatch<'_>]) {
-    let Some(route) = datagram.peer.and_then(|peer| listener.route(peer)) else {
+fn route(datagram: Received, listener: &Listener, batches: &mut [VehicleBatch<'_>], now: Instant) {
+    let known = datagram.peer.and_then(|peer| Some((peer, listener.route(peer)?)));
+    let Some((peer, route)) = known else {
         match (batches.first(), datagram.peer) {
             (Some(first), Some(peer)) => first.queue.refuse_unknown_sender(peer),
             (Some(first), None) => first.queue.record_drop(0, Cause::Sender, 1),
@@ -277,7 +280,12 @@ fn route(datagram: Received, listener: &Listener, batches: &mut [VehicleBatch<'_
     if datagram.length > DATAGRAM_BYTES_MAX {
         batch.queue.record_drop(route.source, Cause::Length, 1);
     } else {
-        batch.readings.push((route.source, datagram.received_ns, Body::Datagram(datagram.payload)));
+        let body = Body::Datagram(datagram.payload);
+        // A sensor sends its telemetry from another port.
+        if datagram.length != TELEMETRY_LENGTH {
+            batch.queue.drops().senders.note(route.source, &body, &SensorSender::Address(peer), now);
+        }
+        batch.readings.push((route.source, datagram.received_ns, body));
     }
 }
 
@@ -327,8 +335,8 @@ mod tests {
         let (queue, _events) = event_queue(4);
         let mut batches = [VehicleBatch { vehicle: 0, queue: &queue, readings: Vec::new() }];
         let datagram = |peer| Received { peer, received_ns: Some(7), length: 3, payload: "abc".into() };
-        route(datagram(None), listener, &mut batches);
-        route(datagram(Some(([10, 0, 0, 1], 2368).into())), listener, &mut batches);
+        route(datagram(None), listener, &mut batches, Instant::now());
+        route(datagram(Some(([10, 0, 0, 1], 2368).into())), listener, &mut batches, Instant::now());
         assert_eq!(batches[0].readings, [(0, Some(7), Body::Datagram("abc".into()))]);
         let mut ledger = Ledger::default();
         queue.drops().add_unreported_to(&mut ledger, []);
