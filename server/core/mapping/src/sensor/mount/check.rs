@@ -30,6 +30,8 @@ const AHEAD_M: f32 = 12.0;
 const BESIDE_M: f32 = 4.0;
 /// Greatest height of a cell over the configured ground, metres: 1.5 m of height or 7 degrees of tilt.
 const Z_M: f32 = 1.5;
+/// The same for a scan without ground within that: the mount is wrong by more. Ours: no sensor of a vehicle is higher.
+const FAR_Z_M: f32 = 5.0;
 /// Number of points that are read of a scan, about. Ours: a third of an HDL-64E's; the cells need no more, and each map
 /// waits for the comparison.
 const POINTS: usize = 40_000;
@@ -91,7 +93,7 @@ impl MountCheck {
 
     /// Adds a scan of the sensor at `origin_m`, both in the ego frame.
     pub fn push(&mut self, sweep: &Sweep, origin_m: [f32; 3]) {
-        let Some(plane) = self.ground_plane(sweep) else { return };
+        let Some(plane) = [Z_M, FAR_Z_M].into_iter().find_map(|z_m| self.ground_plane(sweep, z_m)) else { return };
         let [x, y, _] = origin_m.map(f64::from);
         let normal = Vector3::new(-plane.x, -plane.y, 1.0).normalize();
         let (roll_rad, pitch_rad) =
@@ -117,14 +119,15 @@ impl MountCheck {
             Some(MountDeviation { height_m, pitch_rad, roll_rad, std, scans: self.deviations.len(), contradicts });
     }
 
-    /// The plane z = a x + b y + c of the ground near the vehicle's path, as (a, b, c); `None` if few cells show it.
-    fn ground_plane(&mut self, sweep: &Sweep) -> Option<Vector3<f64>> {
+    /// The plane z = a x + b y + c of the ground near the vehicle's path and within `z_m` of the configured height, as
+    /// (a, b, c); `None` if few cells show it.
+    fn ground_plane(&mut self, sweep: &Sweep, z_m: f32) -> Option<Vector3<f64>> {
         self.cells.clear();
         self.cells.resize(CELLS_AHEAD * CELLS_BESIDE, f32::INFINITY);
         // An odd step reads all lasers of a firing in turn.
         let step = (sweep.x.len() / POINTS) | 1;
         for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z).step_by(step) {
-            if x.abs() < AHEAD_M && y.abs() < BESIDE_M && z.abs() < Z_M {
+            if x.abs() < AHEAD_M && y.abs() < BESIDE_M && z.abs() < z_m {
                 // The sum of a value just below the limit may be rounded to the limit.
                 let row = (((x + AHEAD_M) / CELL_M) as usize).min(CELLS_AHEAD - 1);
                 let cell = row * CELLS_BESIDE + (((y + BESIDE_M) / CELL_M) as usize).min(CELLS_BESIDE - 1);
@@ -210,7 +213,7 @@ mod tests {
         }
         let right = check.deviation().unwrap();
         assert!(!right.contradicts && right.scans == 100 && (right.height_m + 0.02).abs() < 0.01, "{right:?}");
-        for (slope, height_m) in [(0.0, -0.3), (0.0, 0.3), (0.05, 0.0), (-0.05, 0.1)] {
+        for (slope, height_m) in [(0.0, -0.3), (0.0, 0.3), (0.05, 0.0), (-0.05, 0.1), (0.0, 1.6), (0.0, 3.1), (0.03, -1.7)] {
             let mut check = MountCheck::default();
             for scans in 1..=30 {
                 check.push(&sweep(slope, height_m), origin_m);
