@@ -3,7 +3,9 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use clearway_lidar::SensorStatus;
 use clearway_mapping::pipeline::NamedStatus;
+use clearway_proto::v1;
 use futures::future::select_all;
 use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
@@ -173,6 +175,7 @@ fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing,
             && silent.is_none_or(|age| age > SILENT_AFTER),
         left_out: if matches!(left_out, "late" | "ahead" | "silent") { left_out.to_owned() } else { String::new() },
         completeness: state.filter(|_| left_out != "silent").map(|state| state.completeness),
+        packets: state.and_then(|state| Some([state.packets, packets_of_model(&sensor.status, state)?])),
         clock: sensor.status.clock.map_or("", |clock| clock.as_str()).to_owned(),
         clock_offset_ms: sensor.status.clock_offset_ms,
         senders,
@@ -182,6 +185,12 @@ fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing,
             .filter(|mount| mount.contradicts)
             .map(|mount| [mount.height_m, mount.pitch_rad.to_degrees(), mount.roll_rad.to_degrees()]),
     }
+}
+
+/// Packets that a sensor of this model sends in a revolution; `None` if it sends no packets.
+fn packets_of_model(sensor: &SensorStatus, state: &v1::SensorState) -> Option<u32> {
+    let period_ns = sensor.model?.spec().packet_period_ns(sensor.return_mode?);
+    (state.rpm > 0.0).then(|| (60e9 / (f64::from(state.rpm) * f64::from(period_ns))).round() as u32)
 }
 
 #[cfg(test)]

@@ -21,8 +21,9 @@ const LOSS_WARNS: f64 = 0.01;
 const LOSS_ENDS: f64 = 0.005;
 /// Completeness of the newest revolution below which a sensor warns. Ours.
 const COMPLETENESS_MIN: f32 = 0.9;
-/// Difference of the clocks of host and sensor above which a sensor warns, in ms. Ours: three times the validity.
-const CLOCK_OFFSET_MS_MAX: i64 = 1000;
+/// Packets of a revolution beside those that its model sends, above which they are of another model. Ours: an HDL-32E,
+/// which can be read as a VLP-16, sends 2.4 times as many.
+const MODEL_PACKETS_MAX: f64 = 1.5;
 
 /// State of a vehicle, better ones first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
@@ -100,6 +101,8 @@ pub struct SensorFacts {
     pub left_out: String,
     /// Covered share of its newest revolution.
     pub completeness: Option<f32>,
+    /// Packets of its newest revolution, and how many its model sends in one.
+    pub packets: Option<[u32; 2]>,
     /// Name of the clock in use.
     pub clock: String,
     /// Time by which the host's clock is ahead of the sensor's, in ms.
@@ -176,7 +179,7 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
     silence(facts, &mut add);
     staleness(facts, &mut add);
     for sensor in &facts.sensors {
-        sensor_findings(sensor, &mut add);
+        sensor_findings(sensor, facts.validity, &mut add);
     }
     if is_lossy {
         add(State::Warn, format!("{:.1} % of the packets of the last 10 s were lost or refused", 100.0 * facts.loss));
@@ -268,7 +271,7 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
     }
 }
 
-fn sensor_findings(sensor: &SensorFacts, add: &mut impl FnMut(State, String)) {
+fn sensor_findings(sensor: &SensorFacts, validity: Duration, add: &mut impl FnMut(State, String)) {
     let name = &sensor.name;
     let is_silent = sensor.silent.is_none_or(|silent| silent > SILENT_AFTER);
     if let Some([height_m, pitch_deg, roll_deg]) = sensor.mount {
@@ -294,13 +297,20 @@ fn sensor_findings(sensor: &SensorFacts, add: &mut impl FnMut(State, String)) {
     if let Some(completeness) = sensor.completeness.filter(|share| *share < COMPLETENESS_MIN) {
         add(State::Warn, format!("{name} covers {:.0} % of its revolution", 100.0 * completeness));
     }
+    if let Some([packets, of_model]) = sensor.packets
+        && f64::from(packets) > MODEL_PACKETS_MAX * f64::from(of_model)
+    {
+        let text = "packets a revolution, more than its model: check `model` of the sensor";
+        add(State::Warn, format!("{name} sends {packets} instead of {of_model} {text}"));
+    }
     if sensor.blocked_deg > 0.0 {
         add(State::Warn, format!("{:.0} deg of {name} are blocked", sensor.blocked_deg));
     }
     if sensor.clock == "holdover" || sensor.clock == "gps_unlocked" {
         add(State::Warn, format!("the clock of {name} is {}", sensor.clock));
     }
-    if sensor.clock_offset_ms.abs() > CLOCK_OFFSET_MS_MAX {
+    // Beyond it maps are stale when they are made, or of the future.
+    if !validity.is_zero() && u128::from(sensor.clock_offset_ms.unsigned_abs()) > validity.as_millis() {
         let offset_s = sensor.clock_offset_ms as f64 / 1e3;
         add(State::Warn, format!("the host's clock is {offset_s:+.1} s ahead of that of {name}"));
     }
@@ -353,7 +363,7 @@ mod tests {
     #[test]
     fn each_thing_that_is_wrong_has_its_words() {
         type Change = fn(&mut Facts);
-        let cases: [(&str, &str, Change); 20] = [
+        let cases: [(&str, &str, Change); 22] = [
             ("error", "the engine has hung for 4 s", |f| f.fault = Some("the engine has hung for 4 s".into())),
             ("warn", "no packets from rear for 76 s", |f| f.sensors[1].silent = Some(ms(76_000))),
             ("warn", "no packets from rear since the server started 60 s ago", |f| f.sensors[1].silent = None),
@@ -386,6 +396,12 @@ mod tests {
             }),
             ("warn", "rear is left out of the newest map: its scan is late", |f| f.sensors[1].left_out = "late".into()),
             ("warn", "top covers 72 % of its revolution", |f| f.sensors[0].completeness = Some(0.72)),
+            (
+                "warn",
+                "top sends 181 instead of 76 packets a revolution, more than its model: check `model` of the sensor",
+                |f| f.sensors[0].packets = Some([181, 76]),
+            ),
+            ("warn", "the host's clock is +0.9 s ahead of that of top", |f| f.sensors[0].clock_offset_ms = 900),
             ("warn", "the clock of top is holdover", |f| f.sensors[0].clock = "holdover".into()),
             ("warn", "4.2 % of the packets of the last 10 s were lost or refused", |f| f.loss = 0.042),
             ("warn", "1 part not yet in the store: no", |f| {

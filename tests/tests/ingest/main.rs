@@ -5,6 +5,7 @@
 mod fixture;
 mod refused;
 mod silent_peer;
+mod two_senders;
 mod zenoh_flood;
 
 use std::collections::BTreeMap;

@@ -103,8 +103,8 @@ fn advice(error: &str) -> Option<&'static str> {
     let ended = ["connection closed", "broken pipe", "operation was canceled", "transport error"];
     if ended.iter().any(|part| error.contains(part)) {
         return Some(
-            "the connection has ended: the server has stopped, requires a certificate (--cert and --key) or does not \
-             accept this one, or has another port for gRPC",
+            "the connection has ended: the server has stopped, encrypts (--ca), requires a certificate (--cert and --key) \
+             or does not accept this one, or has another port for gRPC",
         );
     }
     let has_no_map = error.contains("no map");

@@ -81,7 +81,12 @@ fn lines(vehicle: &v1::Vehicle, is_fleet: bool, now: i64) -> Vec<String> {
         lines.extend(vehicle.sensor_ledgers.get(&state.name).map(|ledger| format!("    {}", ledger_line(ledger))));
     }
     if let Some(ledger) = &vehicle.ledger {
-        lines.push(format!("  {}, dropped by the kernel {}", ledger_line(ledger), ledger.kernel_drops));
+        let loss = 100.0 * vehicle.loss;
+        lines.push(format!(
+            "  {}, by the kernel {}; lost or refused in the last 10 s: {loss:.1} %",
+            ledger_line(ledger),
+            ledger.kernel_drops
+        ));
         let roads_refused: u64 = ledger.roads_refused.values().sum();
         if ledger.poses + ledger.poses_refused + ledger.roads + roads_refused > 0 {
             lines.push(format!(
@@ -150,7 +155,7 @@ fn ledger_line(ledger: &v1::Ledger) -> String {
     let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
     let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
     format!(
-        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; lost {}",
+        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; dropped at the full queue {}",
         ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
     )
 }

@@ -87,7 +87,7 @@ impl Checked {
         }
     }
 
-    /// True if no map differs as far as the file goes, and it is not whole.
+    /// True if the maps that were compared are equal, and the file is not whole.
     pub fn is_equal_but_not_whole(&self) -> bool {
         let incomplete = match &self.outcome {
             Outcome::Verified(report) => report.incomplete.as_ref(),
@@ -95,7 +95,7 @@ impl Checked {
             Outcome::Unreadable(_) => None,
         };
         let is_empty = match &self.outcome {
-            Outcome::Verified(report) => report.events == 0,
+            Outcome::Verified(report) => report.equal == 0,
             Outcome::Compared(comparison) => comparison.before + comparison.after == 0,
             Outcome::Unreadable(_) => true,
         };

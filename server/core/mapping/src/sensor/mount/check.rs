@@ -213,7 +213,9 @@ mod tests {
         }
         let right = check.deviation().unwrap();
         assert!(!right.contradicts && right.scans == 100 && (right.height_m + 0.02).abs() < 0.01, "{right:?}");
-        for (slope, height_m) in [(0.0, -0.3), (0.0, 0.3), (0.05, 0.0), (-0.05, 0.1), (0.0, 1.6), (0.0, 3.1), (0.03, -1.7)] {
+        for (slope, height_m) in
+            [(0.0, -0.3), (0.0, 0.3), (0.05, 0.0), (-0.05, 0.1), (0.0, 1.6), (0.0, 3.1), (0.03, -1.7)]
+        {
             let mut check = MountCheck::default();
             for scans in 1..=30 {
                 check.push(&sweep(slope, height_m), origin_m);
