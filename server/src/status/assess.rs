@@ -168,6 +168,7 @@ fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing,
     let silent = since(seen.read_at);
     let state = changing.states.iter().find(|state| state.name == sensor.name);
     let left_out = state.map_or("", |state| &state.state);
+    let whole = state.filter(|state| state.partial.is_empty());
     SensorFacts {
         name: sensor.name.clone(),
         silent,
@@ -175,7 +176,7 @@ fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing,
             && silent.is_none_or(|age| age > SILENT_AFTER),
         left_out: if matches!(left_out, "late" | "ahead" | "silent") { left_out.to_owned() } else { String::new() },
         completeness: state.filter(|_| left_out != "silent").map(|state| state.completeness),
-        packets: state.and_then(|state| Some([state.packets, packets_of_model(&sensor.status, state)?])),
+        packets: whole.and_then(|state| Some([state.packets, packets_of_model(&sensor.status, state)?])),
         clock: sensor.status.clock.map_or("", |clock| clock.as_str()).to_owned(),
         clock_offset_ms: sensor.status.clock_offset_ms,
         senders,

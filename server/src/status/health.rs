@@ -101,7 +101,7 @@ pub struct SensorFacts {
     pub left_out: String,
     /// Covered share of its newest revolution.
     pub completeness: Option<f32>,
-    /// Packets of its newest revolution, and how many its model sends in one.
+    /// Packets of its newest revolution, if it is whole, and how many its model sends in one.
     pub packets: Option<[u32; 2]>,
     /// Name of the clock in use.
     pub clock: String,
