@@ -34,7 +34,7 @@ macro_rules! in_a_browser {
 }
 
 /// Runs a test while no other runs: a browser without a graphics card draws with all processors, and beside a second
-/// one it would answer a click after minutes.
+/// one it answers a click after half a minute or never.
 #[cfg(clearway_browser)]
 fn one_at_a_time(test: fn()) {
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
