@@ -5,10 +5,10 @@ use std::io::Cursor;
 use std::path::Path;
 
 use bytes::{Buf, Bytes};
-use clearway::config::Config;
-use clearway::encode::{event_from_bytes, event_to_proto};
-use clearway::ingest::observation::{Limits, decode};
-use clearway::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::config::Config;
+use clearway_daemon::encode::{event_from_bytes, event_to_proto};
+use clearway_daemon::ingest::observation::{Limits, decode};
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;

@@ -8,9 +8,9 @@ use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use clearway::config::Config;
-use clearway::encode::event_to_proto;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::config::Config;
+use clearway_daemon::encode::event_to_proto;
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_mapping::event::{self as core, Event};
 use clearway_proto::packed::pack;

@@ -10,9 +10,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use clearway::config::{Config, Udp};
-use clearway::server::{Setup, ShutdownError};
 use clearway_client::{Client, MapStream, MapView, StreamEvent, Subscription, now_ns};
+use clearway_daemon::config::{Config, Udp};
+use clearway_daemon::run::{Setup, ShutdownError};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
@@ -203,7 +203,7 @@ async fn an_engine_that_hangs_is_in_the_status_and_does_not_keep_the_server_from
     let (hang, hung) = std::sync::mpsc::channel::<()>();
     let observer = Box::new(move |_: &Pipeline| _ = hung.recv());
     let setup = Setup { config, observer: Some(observer), ..Setup::default() };
-    let running = clearway::server::Server::start(setup).await.unwrap();
+    let running = clearway_daemon::run::Server::start(setup).await.unwrap();
     let status = running.vehicles.0[0].status.clone();
     assert_eq!(status.fault(), None);
     let vehicle = Vehicle::driving_to(running.inputs[0].udp.unwrap().0, Pace::RealTime);

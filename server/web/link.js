@@ -1,6 +1,6 @@
 // The connection to the server, in the Worker. Out: calls to `on`: update(bytes, arrived_ms), text(string), state({
 // phase, text, retry_in_ms }). It reconnects with growing pauses; a connection on which nothing arrives counts as lost.
-// Server: WebSocket live (server/src/publish/page_live.rs).
+// Server: WebSocket live (server/daemon/src/publish/page_live.rs).
 
 const PAUSE_MS_MIN = 250, PAUSE_MS_MAX = 5000;
 // The server sends a status every second, so four missing ones mean that the connection is lost.

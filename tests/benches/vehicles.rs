@@ -19,9 +19,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use clearway::config::{Config, Udp};
-use clearway::server::{Server, Setup};
 use clearway_client::{Client, Observation, Subscription, now_ns};
+use clearway_daemon::config::{Config, Udp};
+use clearway_daemon::run::{Server, Setup};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::vehicle::{Datagram, SimulatedVehicle};
@@ -281,7 +281,7 @@ async fn serve(vehicles: usize) {
     vehicle.sensors[0].gps_late_days_max = 36_525.0;
     let first = vehicle.clone();
     config.vehicles =
-        (0..vehicles).map(|number| clearway::config::Vehicle { name: name(number), ..first.clone() }).collect();
+        (0..vehicles).map(|number| clearway_daemon::config::Vehicle { name: name(number), ..first.clone() }).collect();
     let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
     print!("{}", running.grpc.expect("gRPC is served"));
     running.inputs.iter().for_each(|input| print!(" {}", input.udp.expect("a socket").0));

@@ -6,7 +6,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 
-use clearway::config::Config;
+use clearway_daemon::config::Config;
 
 use crate::roles::{Process, ROUTER_ENVIRONMENT, server_binary};
 

@@ -10,10 +10,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::Subcommand;
-use clearway::config::{Config, Vehicle, ZenohMode};
 use clearway_client::{
     Client, MapStream, MapView, Observation, Staleness, StreamEvent, Subscription, Update, ZenohClient, now_ns,
 };
+use clearway_daemon::config::{Config, Vehicle, ZenohMode};
 use clearway_lidar::model::Model;
 use clearway_proto::v1;
 use clearway_sim::scanner::ScannerConfig;

@@ -10,8 +10,8 @@ use std::path::Path;
 use std::sync::Mutex;
 use std::time::Duration;
 
-use clearway::publish::listen::access::RPCS;
-use clearway::server::Running;
+use clearway_daemon::publish::listen::access::RPCS;
+use clearway_daemon::run::Running;
 use clearway_proto::v1;
 use fixture::certificates::{TOKEN, certificates, start, with_roles, zenoh_file};
 use fixture::{Driving, https, until, within};

@@ -19,10 +19,10 @@ use std::net::UdpSocket;
 use std::ops::Range;
 
 use astar::Planner;
-use clearway::server::{Running, Server, Setup};
 use clearway_client::ingest::Ingester;
 use clearway_client::stream::MapStream;
 use clearway_client::{Client, MapView, Observation, Subscription, ZenohClient};
+use clearway_daemon::run::{Running, Server, Setup};
 use clearway_sim::contact::Hull;
 use clearway_sim::course::{Course, Drive};
 use clearway_sim::scanner::ScannerConfig;

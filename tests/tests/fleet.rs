@@ -4,10 +4,10 @@ mod fixture;
 
 use std::sync::{Arc, Mutex, mpsc};
 
-use clearway::config::ZenohMode;
-use clearway::ingest::queue::Reading;
-use clearway::server::{Running, Server, Setup};
 use clearway_client::{MapStream, StreamEvent, ZenohClient};
+use clearway_daemon::config::ZenohMode;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::run::{Running, Server, Setup};
 use fixture::routers::router;
 use fixture::{config, feed, readings, sequence, start, within};
 use zenoh::sample::SampleKind;

@@ -3,11 +3,11 @@
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
-use clearway::ingest::files::Readings;
-use clearway::ingest::files::mcap::McapOptions;
-use clearway::ingest::queue::Reading;
-use clearway::record::mcap_reader::McapReader;
-use clearway::record::repair::repair;
+use clearway_daemon::ingest::files::Readings;
+use clearway_daemon::ingest::files::mcap::McapOptions;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::record::mcap_reader::McapReader;
+use clearway_daemon::record::repair::repair;
 use mcap::WriteOptions;
 use mcap::records::op;
 use rusqlite::Connection;

@@ -9,8 +9,8 @@ use std::net::UdpSocket;
 
 use clearway::cli::make::demo::car::address;
 use clearway::cli::make::demo::rig::{Rig, TimedObservation};
-use clearway::config::{Sender, Udp};
 use clearway_client::{Client, MapView};
+use clearway_daemon::config::{Sender, Udp};
 use clearway_mapping::config::BodyConfig;
 use clearway_proto::v1;
 use clearway_sim::traffic::{Footprints, street};

@@ -5,7 +5,7 @@ mod fixture;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use clearway::server::Running;
+use clearway_daemon::run::Running;
 use fixture::certificates::{self, behind, certificates, router};
 use fixture::venv::{self, run};
 use fixture::{config, feed, readings, start, until, within};

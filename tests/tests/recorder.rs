@@ -12,12 +12,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use clearway::config::{Config, RecordedMaps};
-use clearway::ingest::queue::Reading;
-use clearway::record::mcap_reader::{McapReader, Message};
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::record::verify::verify;
-use clearway::server::{Running, Server, Setup};
+use clearway_daemon::config::{Config, RecordedMaps};
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::record::mcap_reader::{McapReader, Message};
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::record::verify::verify;
+use clearway_daemon::run::{Running, Server, Setup};
 use clearway_mapping::event::Body;
 use clearway_proto::v1;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
@@ -203,8 +203,8 @@ async fn finished_parts_go_to_the_store_and_none_is_deleted_before_it_is_confirm
 
     std::fs::remove_file(&away).unwrap();
     until("both are confirmed", || recorder().store_confirmed >= 2 && recorder().store_problem.is_empty()).await;
-    let stored = clearway::store::location::open(away.join("store").to_str().unwrap()).unwrap();
-    let found = clearway::store::index::search(&*stored, &Default::default()).await.unwrap().entries;
+    let stored = clearway_daemon::store::location::open(away.join("store").to_str().unwrap()).unwrap();
+    let found = clearway_daemon::store::index::search(&*stored, &Default::default()).await.unwrap().entries;
     assert!(found.len() >= 2 && found.iter().all(|entry| entry.vehicle == "car" && entry.events > 0), "{found:?}");
     within("shutdown", running.shutdown()).await.unwrap();
     assert!(!finished("car.mcap"), "the end of the last part deletes the oldest confirmed one");
@@ -415,7 +415,7 @@ fn kill_9_costs_no_event_that_the_status_called_durable() {
             }
         }
         server.kill().unwrap();
-        let killed_ns = clearway::base::clock::now_ns();
+        let killed_ns = clearway_daemon::base::clock::now_ns();
         server.wait().unwrap();
         let file: PathBuf = folder.path().join(format!("run{run}.unfinished.mcap"));
         let report = verify(&file).unwrap();

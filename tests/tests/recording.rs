@@ -10,11 +10,11 @@ use std::io::BufWriter;
 use std::net::SocketAddr;
 use std::path::Path;
 
-use clearway::config::Config;
-use clearway::ingest::queue::Reading;
-use clearway::record::reader::{RecordingError, RecordingReader};
-use clearway::record::verify::{DifferenceKind, verify};
-use clearway::server::{Server, Setup};
+use clearway_daemon::config::Config;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::record::reader::{RecordingError, RecordingReader};
+use clearway_daemon::record::verify::{DifferenceKind, verify};
+use clearway_daemon::run::{Server, Setup};
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
@@ -91,7 +91,7 @@ async fn planted_nondeterminism_is_named_by_sequence_layer_and_cell() {
             _ => return Some(data),
         };
         if sequence == 3 {
-            map.header.as_mut().unwrap().completed_ns = clearway::base::clock::now_ns();
+            map.header.as_mut().unwrap().completed_ns = clearway_daemon::base::clock::now_ns();
             return Some(map.encode_to_vec());
         }
         let channel = &mut map.layers[0].channels[0];
@@ -174,7 +174,7 @@ async fn a_truncated_recording_is_read_to_its_last_whole_chunk() {
         most = most.max(events);
     }
     assert!(most > 0, "whole chunks before the cut are read");
-    assert!(matches!(events_in(3), Err(clearway::record::verify::VerifyError::Recording(_))));
+    assert!(matches!(events_in(3), Err(clearway_daemon::record::verify::VerifyError::Recording(_))));
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -199,7 +199,7 @@ fn an_mcap_file_without_a_configuration_is_refused() {
     mcap::Writer::new(BufWriter::new(File::create(&file).unwrap())).unwrap().finish().unwrap();
     let error = verify(&file).unwrap_err();
     assert!(
-        matches!(error, clearway::record::verify::VerifyError::Recording(RecordingError::NoConfig { .. })),
+        matches!(error, clearway_daemon::record::verify::VerifyError::Recording(RecordingError::NoConfig { .. })),
         "{error}"
     );
 }

@@ -10,9 +10,9 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 
 use clearway::cli::make::replay::{Options, Summary, replay};
-use clearway::config::Only;
-use clearway::server::{Running, Server, Setup};
 use clearway_client::{Client, ClientError, Observation, PublicKey, Subscription, Tls, ZenohClient, now_ns};
+use clearway_daemon::config::Only;
+use clearway_daemon::run::{Running, Server, Setup};
 use fixture::certificates::{behind, certificates, router, secured, start, zenoh_file};
 use fixture::{config, feed, grpc, readings, until, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -86,7 +86,7 @@ async fn a_recording_has_the_path_of_the_private_key_but_not_the_key() {
     let running = start(config).await;
     feed(&running, readings(1)).await;
     within("shutdown", running.shutdown()).await.unwrap();
-    let recording = clearway::record::reader::RecordingReader::open(&record).unwrap();
+    let recording = clearway_daemon::record::reader::RecordingReader::open(&record).unwrap();
     let text = recording.header().config.clone().unwrap();
     assert!(text.contains("server.key") && !text.contains("PRIVATE"), "{text}");
     let key = std::fs::read_to_string(certificates("ours").join("server.key")).unwrap();

@@ -3,9 +3,9 @@
 
 mod fixture;
 
-use clearway::config::ZenohMode;
-use clearway::server::Running;
 use clearway_client::{Client, ClientError, Subscription, ZenohClient};
+use clearway_daemon::config::ZenohMode;
+use clearway_daemon::run::Running;
 use fixture::routers::{router, router_with};
 use fixture::{config, feed, readings, start, until, within};
 

@@ -11,10 +11,10 @@ use std::path::Path;
 
 use clearway::cli::make::demo::rig::Rig;
 use clearway::cli::make::replay::{Options, replay};
-use clearway::config::Config;
-use clearway::encode::EncodedMap;
-use clearway::ingest::observation;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::config::Config;
+use clearway_daemon::encode::EncodedMap;
+use clearway_daemon::ingest::observation;
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::MapsConfig;
 use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::map::Map;

@@ -5,7 +5,7 @@ mod fixture;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Stdio};
 
-use clearway::server::{Server, Setup};
+use clearway_daemon::run::{Server, Setup};
 use clearway_proto::v1;
 use fixture::{Driving, config, feed, grpc, readings, start, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
-use clearway::config::{Config, Recorder};
-use clearway::record::writer::{Files, Folder};
-use clearway::store::index::{Entry, Search, search};
-use clearway::store::{location, upload};
+use clearway_daemon::config::{Config, Recorder};
+use clearway_daemon::record::writer::{Files, Folder};
+use clearway_daemon::store::index::{Entry, Search, search};
+use clearway_daemon::store::{location, upload};
 use clearway_tests::{binaries, workspace};
 use serde_json::Value;
 

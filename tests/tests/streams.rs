@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use bytes::Bytes;
-use clearway::server::{Server, Setup};
+use clearway_daemon::run::{Server, Setup};
 use clearway_proto::v1;
 use clearway_sim::send::{Pace, Until, drive};
 use fixture::{
@@ -31,7 +31,7 @@ impl Requests {
     }
 }
 
-async fn watch(running: &clearway::server::Running, max_in_flight: u32) -> (Requests, Streaming<v1::MapUpdate>) {
+async fn watch(running: &clearway_daemon::run::Running, max_in_flight: u32) -> (Requests, Streaming<v1::MapUpdate>) {
     let (sender, mut requests) = mpsc::channel(16);
     sender.send(selection("car", &[LAYER], max_in_flight)).await.unwrap();
     let requests = futures::stream::poll_fn(move |context| requests.poll_recv(context));
@@ -40,7 +40,7 @@ async fn watch(running: &clearway::server::Running, max_in_flight: u32) -> (Requ
 }
 
 /// A zenoh session connected to the server only.
-async fn session(running: &clearway::server::Running) -> Session {
+async fn session(running: &clearway_daemon::run::Running) -> Session {
     let mut config = zenoh::Config::default();
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
     config.insert_json5("mode", "\"client\"").unwrap();
@@ -91,7 +91,7 @@ async fn grpc_zenoh_and_the_recording_have_the_same_bytes_of_a_live_drive() {
     for (sequence, map) in over_grpc.iter().chain(&over_zenoh) {
         assert_eq!(recorded[&(*sequence, LAYER.to_owned())], map, "sequence {sequence}");
     }
-    let report = clearway::record::verify::verify(&record).unwrap();
+    let report = clearway_daemon::record::verify::verify(&record).unwrap();
     assert!(report.is_good() && report.maps >= 3, "{report:?}");
 }
 
@@ -123,7 +123,7 @@ async fn refused_datagrams_are_counted_by_reason_and_the_ledger_adds_up() {
 async fn a_sender_that_is_not_configured_is_refused_for_its_source() {
     let mut config = config();
     let udp = config.vehicles[0].udp.as_mut().unwrap();
-    udp.from.insert("top".into(), clearway::config::Sender::Address("127.0.0.2".parse().unwrap()));
+    udp.from.insert("top".into(), clearway_daemon::config::Sender::Address("127.0.0.2".parse().unwrap()));
     let running = start(config).await;
     let (data, _) = running.inputs[0].udp.unwrap();
     let packet = readings(1).into_iter().find_map(|reading| match reading.body {
@@ -369,7 +369,7 @@ async fn two_vehicles_have_their_own_sockets_maps_and_journals() {
     let status = client.get_map(get("")).await.unwrap_err();
     assert!(status.message().contains("car, truck"), "of several vehicles one must be named: {status}");
     within("shutdown", running.shutdown()).await.unwrap();
-    let report = clearway::record::verify::verify(&record).unwrap();
+    let report = clearway_daemon::record::verify::verify(&record).unwrap();
     assert!(report.is_good() && report.maps > maps, "{report:?}");
 }
 

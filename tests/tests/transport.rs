@@ -9,11 +9,11 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use clearway::cli::make::replay::{Options, ReplayError, Summary, replay};
-use clearway::encode::as_served;
-use clearway::ingest::queue::Reading;
-use clearway::record::verify::verify;
-use clearway::server::Running;
 use clearway_client::{Client, ClientError, MapStream, MapView, StreamEvent, Subscription};
+use clearway_daemon::encode::as_served;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::record::verify::verify;
+use clearway_daemon::run::Running;
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;

@@ -9,12 +9,12 @@ use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 
 use clearway::cli::make::replay::{Options, replay};
-use clearway::config::{Config, Sender, Udp};
-use clearway::ingest::queue::event_queue;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::record::verify::verify;
-use clearway::server::Running;
-use clearway::status::{Format, prometheus};
+use clearway_daemon::config::{Config, Sender, Udp};
+use clearway_daemon::ingest::queue::event_queue;
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::record::verify::verify;
+use clearway_daemon::run::Running;
+use clearway_daemon::status::{Format, prometheus};
 use clearway_lidar::capture::Capture;
 use clearway_mapping::event::{Body, Cause};
 use clearway_mapping::ledger::Ledger;
@@ -260,7 +260,7 @@ fn drive(path: &str) -> PathBuf {
 }
 
 /// The vehicle `name` with a level sensor 1.9 m above the ground that receives at `at` from the sender `from`.
-fn receiving_at(name: &str, at: SocketAddr, from: &str) -> clearway::config::Vehicle {
+fn receiving_at(name: &str, at: SocketAddr, from: &str) -> clearway_daemon::config::Vehicle {
     let mut vehicle = Config::of_one_vehicle(name, "top").vehicles.remove(0);
     vehicle.sensors[0].extrinsics.z_m = 1.9;
     // These captures are years old; the server accepts their time all the same.

@@ -7,11 +7,11 @@ use std::f64::consts::FRAC_PI_4;
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 
-use clearway::config::{Config, Foxglove, Ros2};
-use clearway::encode::viewer::Raster;
-use clearway::ingest::queue::Reading;
-use clearway::server::{Running, Server, Setup};
 use clearway_client::{MapView, SafePoint};
+use clearway_daemon::config::{Config, Foxglove, Ros2};
+use clearway_daemon::encode::viewer::Raster;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::run::{Running, Server, Setup};
 use clearway_mapping::event::{Body, EgoPose};
 use fixture::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};

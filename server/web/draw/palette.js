@@ -4,7 +4,7 @@
 export const UNKNOWN = [58, 63, 70];
 
 // Colours from blue, lighter than unknown cells, to light yellow, even in lightness, for colour-blind eyes and in grey;
-// t from 0 to 1. Exported pictures have the same (server/src/encode/palette.rs).
+// t from 0 to 1. Exported pictures have the same (server/daemon/src/encode/palette.rs).
 const STOPS = [[48, 88, 184], [100, 120, 150], [150, 154, 140], [206, 192, 112], [254, 232, 90]];
 
 // The colours as a CSS gradient from left to right.

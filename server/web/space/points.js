@@ -1,5 +1,5 @@
 // In: a binary message of the server. Out: the points of one vehicle, if it is a frame of points. The format is that of
-// server/src/publish/page_points.rs.
+// server/daemon/src/publish/page_points.rs.
 
 import { egoFrom, yawOf } from "../vehicle/view.js";
 import { DecodeError } from "../wire/limits.js";

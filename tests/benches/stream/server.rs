@@ -6,9 +6,9 @@ use std::net::{SocketAddr, TcpListener};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use clearway::config::{Config, Udp};
-use clearway::server::{Server, Setup};
 use clearway_client::now_ns;
+use clearway_daemon::config::{Config, Udp};
+use clearway_daemon::run::{Server, Setup};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_tests::siege::watch::processor_s;
 use tokio::io::AsyncReadExt;

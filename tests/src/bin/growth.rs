@@ -19,7 +19,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use clearway::config::Udp;
+use clearway_daemon::config::Udp;
 use clearway_tests::growth::{Model, PARTS, Size};
 use clearway_tests::larger_fleet::Fleet;
 use clearway_tests::roles::{Process, ROUTER_ENVIRONMENT, Role, last_line, name, server_binary, server_config};

@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use clearway::cli::make::demo::rig::Rig;
-use clearway::config::Config;
+use clearway_daemon::config::Config;
 use clearway_proto::v1;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;

@@ -1,8 +1,8 @@
 //! The networks between the car's sensors and the server: what the sensors send, with their faults, until it arrives.
 
 use bytes::Bytes;
-use clearway::ingest::engine_time::EngineTime;
-use clearway::ingest::udp::DATAGRAM_BYTES_MAX;
+use clearway_daemon::ingest::engine_time::EngineTime;
+use clearway_daemon::ingest::udp::DATAGRAM_BYTES_MAX;
 use clearway_mapping::event::{Body, Cause};
 use clearway_sim::vehicle::Datagram;
 use prost::Message;

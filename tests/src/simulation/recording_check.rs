@@ -5,10 +5,10 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use clearway::record::mcap_file::Disk;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::record::verify::{Difference, DifferenceKind, Report, verify};
-use clearway::record::writer::{Files, RecorderCounts};
+use clearway_daemon::record::mcap_file::Disk;
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::record::verify::{Difference, DifferenceKind, Report, verify};
+use clearway_daemon::record::writer::{Files, RecorderCounts};
 
 use super::checks::{Violation, violation};
 use super::fault_plan::DiskFault;
@@ -198,7 +198,7 @@ impl Recorded {
 }
 
 /// The sequences of the events of a recording.
-fn events_of(file: &Path) -> Result<Vec<u64>, clearway::record::reader::RecordingError> {
+fn events_of(file: &Path) -> Result<Vec<u64>, clearway_daemon::record::reader::RecordingError> {
     let mut events = Vec::new();
     for message in RecordingReader::open(file)? {
         if let RecordedMessage::Event { event, .. } = message? {

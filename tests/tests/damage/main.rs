@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use clearway::record::mcap_reader::McapReader;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::record::repair::repair;
-use clearway::record::verify::verify;
+use clearway_daemon::record::mcap_reader::McapReader;
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::record::repair::repair;
+use clearway_daemon::record::verify::verify;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;

@@ -12,12 +12,12 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use bytes::Bytes;
-use clearway::config::Config;
-use clearway::ingest::queue::Reading;
-use clearway::record::verify::verify;
-use clearway::server::{Running, Server, Setup};
 use clearway_client::observation::{RoadFrame, RoadPurpose, Sensor, by_reason};
 use clearway_client::{Client, ClientError, Ingester, Observation, Refusal, ZenohClient, now_ns};
+use clearway_daemon::config::Config;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::record::verify::verify;
+use clearway_daemon::run::{Running, Server, Setup};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Body;
 use clearway_proto::packed::{pack, unpack};
@@ -142,7 +142,7 @@ async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
     let file = Path::new(env!("CLEARWAY_DRIVES")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
-    let drive = clearway::ingest::files::capture::Source::open(&file).unwrap();
+    let drive = clearway_daemon::ingest::files::capture::Source::open(&file).unwrap();
     let readings: Vec<Reading> = drive.map(Result::unwrap).collect();
     assert_eq!(readings.len(), 976);
     let maps = assert_tunnelled_makes_the_maps_of_the_file(config(), readings).await;

@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use bytes::Bytes;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::record::verify::verify;
 use clearway_client::observation::by_reason;
 use clearway_client::{ClientError, Ingester, Observation};
+use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::record::verify::verify;
 use clearway_mapping::event::{Body, Cause, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;

@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 
-use clearway::server::Running;
+use clearway_daemon::run::Running;
 use clearway_proto::v1;
 use clearway_tests::attack::http2::{self, frame};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

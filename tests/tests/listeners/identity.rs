@@ -4,8 +4,8 @@
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use clearway::config::Only;
 use clearway_client::{Client, ClientError, Subscription, Tls};
+use clearway_daemon::config::Only;
 
 use super::fixture::certificates::{TOKEN, certificates, secured, start, with_roles};
 use super::fixture::https::ask;

@@ -11,9 +11,9 @@ use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
 use std::process::{Command, Stdio};
 
-use clearway::config::{Config, Foxglove, Metrics, Vehicle};
-use clearway::server::Running;
 use clearway_client::Client;
+use clearway_daemon::config::{Config, Foxglove, Metrics, Vehicle};
+use clearway_daemon::run::Running;
 use clearway_proto::v1;
 use clearway_tests::attack::http2::{answer_pings_only, never_read};
 use clearway_tests::attack::sockets::{OPENINGS, Opening, closed, hold};
@@ -218,7 +218,7 @@ async fn every_listener_survives_the_lack_of_file_handles_and_a_hangup() {
     let switches = ["metrics.enabled=true", "foxglove.enabled=true", "zenoh.enabled=false"].map(str::to_owned);
     let udp = ["vehicle.udp.data=127.0.0.1:0", "vehicle.udp.telemetry=127.0.0.1:0"].map(str::to_owned);
     arguments.extend(any.into_iter().chain(switches).chain(udp).flat_map(|set| ["--set".to_owned(), set]));
-    std::fs::write(folder.path().join("c.toml"), clearway::config::COMMENTED).unwrap();
+    std::fs::write(folder.path().join("c.toml"), clearway_daemon::config::COMMENTED).unwrap();
     let command = clearway_tests::binaries().join("clearway");
     // 60 handles are fewer than the connections that follow.
     let mut server = Command::new("sh")

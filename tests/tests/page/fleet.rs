@@ -7,10 +7,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use clearway::config::Config;
-use clearway::server::{Running, Server, Setup};
-use clearway::status::Transport;
 use clearway_client::{Client, Observation, now_ns};
+use clearway_daemon::config::Config;
+use clearway_daemon::run::{Running, Server, Setup};
+use clearway_daemon::status::Transport;
 use tokio::runtime::Runtime;
 
 use crate::webdriver::Browser;

@@ -9,8 +9,8 @@ use std::future::ready;
 use std::net::SocketAddr;
 use std::pin::Pin;
 
-use clearway::ingest::queue::Reading;
-use clearway::server::Running;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::run::Running;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::{Map, decode_map, decode_map_on};
 use clearway_proto::v1;

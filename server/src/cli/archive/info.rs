@@ -17,13 +17,13 @@ use clearway_mapping::event::Scan;
 use clearway_mapping::scan_file;
 use serde_json::{Map, Value, json};
 
-use crate::base::file_advice::open_to_read;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, printable};
-use crate::encode::event_from_bytes;
-use crate::ingest::files::{Kind, kind};
-use crate::record::mcap_reader::{McapReader, Message};
+use clearway_daemon::base::file_advice::open_to_read;
+use clearway_daemon::encode::event_from_bytes;
+use clearway_daemon::ingest::files::{Kind, kind};
+use clearway_daemon::record::mcap_reader::{McapReader, Message};
 
 /// Describe a file: a recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd).
 #[derive(Args)]

@@ -7,11 +7,11 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use object_store::ObjectStore;
 
-use crate::base::file_advice::advised;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line, stop_signal};
-use crate::store::location;
-use crate::store::upload::{self, UploadError};
+use clearway_daemon::base::file_advice::advised;
+use clearway_daemon::store::location;
+use clearway_daemon::store::upload::{self, UploadError};
 
 /// Time between two looks into the folder.
 const SCAN_PERIOD: Duration = Duration::from_secs(5);

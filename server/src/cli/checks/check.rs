@@ -3,15 +3,15 @@
 use anyhow::Result;
 use clap::Args;
 
-use crate::base::clock::now_ns;
 use crate::cli::shared::configuration::ConfigurationOptions;
 use crate::cli::shared::output::print;
-use crate::config::{COMMENTED, Config};
-use crate::publish::listen::security::Current;
-use crate::server::StartError;
-use crate::status::network::end_text;
+use clearway_daemon::base::clock::now_ns;
+use clearway_daemon::config::{COMMENTED, Config};
+use clearway_daemon::publish::listen::security::Current;
+use clearway_daemon::run::StartError;
+use clearway_daemon::status::network::end_text;
 #[cfg(feature = "zenoh")]
-use crate::zenoh_session;
+use clearway_daemon::zenoh_session;
 
 /// The first lines of the configuration that is printed.
 const HEAD: &str = "# Every value that this configuration has. A comment says where it was given: a line of the file \
@@ -40,7 +40,7 @@ pub struct Options {
 /// Prints the configuration that the options name, as TOML.
 ///
 /// # Errors
-/// [`ConfigError`](crate::config::ConfigError), also for a calibration or a certificate that the file names; an error
+/// [`ConfigError`](clearway_daemon::config::ConfigError), also for a calibration or a certificate that the file names; an error
 /// of certificates that do not fit or of the file of `[zenoh]`.
 pub fn run(options: &Options) -> Result<()> {
     let Options { default, configuration } = options;

@@ -18,10 +18,10 @@ use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::sensor::mount::{MountEstimate, estimate};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
-use crate::base::clock::now_ns;
 use crate::cli::shared::ground_revolutions::{GroundRevolutions, points_of};
 use crate::cli::shared::output::{counted, print};
-use crate::config::Config;
+use clearway_daemon::base::clock::now_ns;
+use clearway_daemon::config::Config;
 
 /// Receive buffer of a socket, in bytes: that of a server.
 const RECEIVE_BUFFER_BYTES: usize = 4 << 20;

@@ -6,7 +6,7 @@
 use clearway_client::Layer;
 use clearway_proto::legend::Class;
 
-use crate::encode::picture::{Picture, PictureError, Style, of_layer};
+use clearway_daemon::encode::picture::{Picture, PictureError, Style, of_layer};
 
 /// A character is twice as high as it is wide.
 const ASPECT: usize = 2;

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use clearway_client::v1;
 
-use crate::status::run_text;
+use clearway_daemon::status::run_text;
 
 /// True if the vehicles belong to several runs of servers.
 pub fn is_of_several_servers(vehicles: &[v1::Vehicle]) -> bool {

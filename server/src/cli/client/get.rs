@@ -13,7 +13,7 @@ use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{block_on, print_line, usage_error};
-use crate::encode::picture;
+use clearway_daemon::encode::picture;
 
 /// Interval at which a server is asked again. Ours: a tenth of a second is a revolution.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);

@@ -10,8 +10,8 @@ use tonic::Code;
 use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
-use crate::record::damage::utc;
-use crate::status::recorder_json;
+use clearway_daemon::record::damage::utc;
+use clearway_daemon::status::recorder_json;
 
 /// Control the recorder of a running server: start, stop, split, save the last seconds, list, status.
 #[derive(Args)]

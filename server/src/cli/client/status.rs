@@ -7,7 +7,7 @@ use clearway_client::v1;
 use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, print_line};
-use crate::status::{State, vehicle_json};
+use clearway_daemon::status::{State, vehicle_json};
 
 /// Print the state of each vehicle: ok, or what is wrong with it.
 ///

@@ -9,7 +9,7 @@ use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::make::replay::options::offset;
 use crate::cli::make::replay::{Speed, state};
 use crate::cli::shared::output::{block_on, print_line, usage_error};
-use crate::replay::control::STEP_MAX;
+use clearway_daemon::replay::control::STEP_MAX;
 
 /// Control the replay of a server: pause, play, step, seek, range, rate, loop, lockstep.
 #[derive(Args)]

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::cli::client::connection::{ServerOptions, explain};
 use crate::cli::client::fleet::{is_of_several_servers, server_text};
 use crate::cli::shared::output::{block_on, counted, print_line};
-use crate::status::vehicle_json;
+use clearway_daemon::status::vehicle_json;
 
 /// List the vehicles of a server and of those it knows: maps, sensors, losses, readers, recording.
 #[derive(Args)]

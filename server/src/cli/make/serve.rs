@@ -4,12 +4,12 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::base::held_sockets::HeldSockets;
 use crate::cli::make::service_manager;
 use crate::cli::shared::configuration::ConfigurationOptions;
 use crate::cli::shared::output::{block_on, stop_signal};
-use crate::config::Config;
-use crate::server::{Running, Server, Setup, ShutdownError};
+use clearway_daemon::base::held_sockets::HeldSockets;
+use clearway_daemon::config::Config;
+use clearway_daemon::run::{Running, Server, Setup, ShutdownError};
 
 /// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
 ///
@@ -28,8 +28,8 @@ pub struct Options {
 /// Runs the server that the configuration describes, until SIGINT or SIGTERM.
 ///
 /// # Errors
-/// [`ConfigError`](crate::config::ConfigError), [`StartError`](crate::server::StartError), and
-/// [`ShutdownError`](crate::server::ShutdownError) at the end.
+/// [`ConfigError`](clearway_daemon::config::ConfigError), [`StartError`](clearway_daemon::run::StartError), and
+/// [`ShutdownError`](clearway_daemon::run::ShutdownError) at the end.
 pub fn run(options: &Options) -> Result<()> {
     let held = HeldSockets::from_environment().context("LISTEN_FDS: a socket of the service manager")?;
     block_on(serve(&options.configuration, held))

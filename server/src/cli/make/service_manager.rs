@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use sd_notify::NotifyState;
 
-use crate::server::Running;
+use clearway_daemon::run::Running;
 
 /// Reports that every address is listened on.
 pub fn ready() {

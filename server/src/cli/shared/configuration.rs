@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use clearway_mapping::config::Extrinsics;
 
-use crate::config::{Config, ConfigError, Origin, of_environment};
+use clearway_daemon::config::{Config, ConfigError, Origin, of_environment};
 
 /// The options that name a configuration file and override its keys.
 #[derive(Args)]

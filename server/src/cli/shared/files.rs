@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
 
-use crate::base::file_advice::{advised, open_to_read};
+use clearway_daemon::base::file_advice::{advised, open_to_read};
 
 /// Opens a file to read; returns it and its length in bytes.
 ///

@@ -14,7 +14,7 @@ use tracing_subscriber::layer::{Context, Layer};
 use tracing_subscriber::prelude::*;
 use tracing_subscriber::{EnvFilter, fmt};
 
-use crate::base::sync::locked;
+use clearway_daemon::base::sync::locked;
 
 /// Most lines of one kind in a [`PERIOD`]. Ours: a start names each sensor and address once.
 const LINES_MAX: u32 = 20;

@@ -6,7 +6,7 @@ use anyhow::{Context, Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use tokio::signal::unix::{SignalKind, signal};
 
-pub use crate::base::counted::counted;
+pub use clearway_daemon::base::counted::counted;
 
 /// Threads of the runtime at least, because zenoh needs several, whatever the machine has.
 const THREADS_MIN: usize = 2;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use clearway::config::{Config, Udp};
+use clearway_daemon::config::{Config, Udp};
 use clearway_tests::digests::Digests;
 use clearway_tests::workspace;
 

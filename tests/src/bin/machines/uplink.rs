@@ -12,7 +12,7 @@ use std::process::{ExitCode, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use clearway::config::Service;
+use clearway_daemon::config::Service;
 use clearway_tests::machines::{Machines, ROUTERS, command, sent_bytes};
 use clearway_tests::roles::{Process, server_config};
 

@@ -2,7 +2,7 @@
 
 use clap::Args;
 
-use crate::encode::picture::Style;
+use clearway_daemon::encode::picture::Style;
 
 /// The options for drawing pictures.
 #[derive(Args)]

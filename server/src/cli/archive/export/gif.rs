@@ -8,7 +8,7 @@ use anyhow::{Result, bail};
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 
 use crate::cli::shared::files;
-use crate::encode::picture::Picture;
+use clearway_daemon::encode::picture::Picture;
 
 /// Place of the width and the height in a GIF.
 const SIZE_AT: u64 = 6;

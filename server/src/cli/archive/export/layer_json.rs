@@ -5,7 +5,7 @@ use clearway_client::grid::Grid;
 use clearway_client::{Channel, Layer, MapView};
 use serde_json::{Value, json};
 
-use crate::status::sensor_json;
+use clearway_daemon::status::sensor_json;
 
 /// The layer and the header of its map as one JSON object. Arrays of cells are row by row, in the order of the grid's
 /// cell index.

@@ -23,8 +23,8 @@ use self::viewer_file::{Dialect, ViewerFile};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, progress_bar, usage_error};
-use crate::encode::picture::{self, Style};
-use crate::record::mcap_reader::{McapReader, Message};
+use clearway_daemon::encode::picture::{self, Style};
+use clearway_daemon::record::mcap_reader::{McapReader, Message};
 pub use drawing::DrawingOptions;
 
 mod drawing;

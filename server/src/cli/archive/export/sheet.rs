@@ -1,6 +1,6 @@
 //! The maps of a layer, in their order -> one picture of many, spread evenly over the drive.
 
-use crate::encode::picture::{Picture, PictureError};
+use clearway_daemon::encode::picture::{Picture, PictureError};
 
 /// Greatest number of pictures on a sheet; ours, because each is still told apart on a screen.
 const PICTURES_MAX: usize = 24;

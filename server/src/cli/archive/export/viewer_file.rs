@@ -13,10 +13,10 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{base_frame, foxglove as messages, ros, safe_paths};
 use anyhow::{Context, Result};
 use clearway_client::{Layer, MapView};
+use clearway_daemon::encode::viewer::raster::Rasters;
+use clearway_daemon::encode::viewer::{base_frame, foxglove as messages, ros, safe_paths};
 use clearway_ros::published::{
     MARKER_ARRAY, OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, POSE_ARRAY, Published, TF_MESSAGE,
 };
@@ -26,7 +26,7 @@ use mcap::records::MessageHeader;
 
 use super::scans::{ScanDecoder, SensorScan};
 use crate::cli::shared::files;
-use crate::record::mcap_reader::{Header, Message};
+use clearway_daemon::record::mcap_reader::{Header, Message};
 
 /// Kind of the messages in the file.
 #[derive(Clone, Copy, PartialEq, Eq)]

@@ -8,8 +8,8 @@ use clearway_mapping::sensor::mount::MountError;
 use super::source::labels::LabelError;
 use super::source::pairs::PairsError;
 use super::source::variation::VariationError;
-use crate::config::ConfigError;
-use crate::ingest::files::kitti::ScanError;
+use clearway_daemon::config::ConfigError;
+use clearway_daemon::ingest::files::kitti::ScanError;
 
 /// Why an evaluation failed.
 #[derive(Debug, thiserror::Error)]

@@ -22,7 +22,7 @@ use indicatif::ProgressBar;
 
 use crate::cli::shared::configuration::extrinsics;
 use crate::cli::shared::output::{print, print_line};
-use crate::config::Config;
+use clearway_daemon::config::Config;
 
 pub mod error;
 pub mod judge;

@@ -7,13 +7,13 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 
-use crate::base::sync::locked;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::with_causes;
-use crate::config::{Calibrations, Config};
-use crate::record::compare::{After, Comparison, compare};
-use crate::record::reader::RecordingReader;
-use crate::record::verify::{Report, verify};
+use clearway_daemon::base::sync::locked;
+use clearway_daemon::config::{Calibrations, Config};
+use clearway_daemon::record::compare::{After, Comparison, compare};
+use clearway_daemon::record::reader::RecordingReader;
+use clearway_daemon::record::verify::{Report, verify};
 
 /// What is checked of each recording.
 pub enum Check {
@@ -32,7 +32,7 @@ impl NewConfig {
     /// Reads a configuration, with overrides, and its calibration tables.
     ///
     /// # Errors
-    /// [`ConfigError`](crate::config::ConfigError).
+    /// [`ConfigError`](clearway_daemon::config::ConfigError).
     pub fn load(file: &Path, set: &[String]) -> Result<Self> {
         let config = Config::load(file, set)?;
         let tables = config.calibrations(file)?;
@@ -137,7 +137,7 @@ fn check_one(file: &Path, check: &Check) -> Checked {
 fn outcome_of(file: &Path, check: &Check) -> Result<Outcome> {
     #[cfg(feature = "store")]
     if let Some(url) = file.to_str().filter(|text| super::files::is_url(text)) {
-        let copy = crate::cli::shared::output::block_on(crate::store::fetch::fetch(url))?;
+        let copy = crate::cli::shared::output::block_on(clearway_daemon::store::fetch::fetch(url))?;
         // A reason names the copy, which is gone when it is read.
         return outcome(copy.path(), check)
             .map_err(|error| anyhow::anyhow!(with_causes(&error).replace(&copy.path().display().to_string(), url)));

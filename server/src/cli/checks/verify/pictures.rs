@@ -6,8 +6,8 @@ use anyhow::Result;
 
 use super::checked::{Checked, Outcome};
 use crate::cli::shared::files;
-use crate::encode::picture::{self, Picture, Style};
-use crate::record::compare::MapChange;
+use clearway_daemon::encode::picture::{self, Picture, Style};
+use clearway_daemon::record::compare::MapChange;
 
 /// Edge of each of the three maps, in pixels; ours, because three of them fit a screen.
 const PIXELS: u32 = 480;

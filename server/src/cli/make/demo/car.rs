@@ -18,8 +18,8 @@ use tokio::sync::watch;
 
 use super::error::DemoError;
 use super::rig::Rig;
-use crate::base::clock::now_ns;
-use crate::engine::newest::Newest;
+use clearway_daemon::base::clock::now_ns;
+use clearway_daemon::engine::newest::Newest;
 
 /// A car that drives until it is stopped.
 pub struct Car {

@@ -90,7 +90,7 @@ async fn demo_and_print(options: Options) -> Result<()> {
 /// What the demo leaves on the disk.
 fn left_behind(record: Option<&Path>, picture: &Path) -> String {
     let size = |path: &Path| path.metadata().map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
-    let parts = record.map(crate::record::writer::parts_of).unwrap_or_default();
+    let parts = record.map(clearway_daemon::record::writer::parts_of).unwrap_or_default();
     let picture = Some(picture.to_owned()).filter(|picture| picture.exists());
     let files: Vec<String> =
         parts.iter().chain(&picture).map(|file| format!("{} ({:.1} MB)", file.display(), size(file))).collect();

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::server::StartError;
+use clearway_daemon::run::StartError;
 
 /// What to do about a port that was free when the demo looked and in use when its server started, as happens to two
 /// demos that start at once; else nothing.
@@ -23,7 +23,7 @@ pub enum DemoError {
     Start(StartError),
     /// The server did not shut down as it should.
     #[error(transparent)]
-    End(#[from] crate::server::ShutdownError),
+    End(#[from] clearway_daemon::run::ShutdownError),
     /// The simulated car could not send datagrams.
     #[error("the simulated car: {0}")]
     Vehicle(#[from] std::io::Error),

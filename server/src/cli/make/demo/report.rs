@@ -8,7 +8,7 @@ use clearway_sim::send::Sent;
 use serde_json::{Value, json};
 
 use crate::cli::shared::output::counted;
-use crate::status::Snapshot;
+use clearway_daemon::status::Snapshot;
 
 /// The state of the demo at one moment.
 #[derive(Clone, Debug)]

@@ -10,11 +10,11 @@ use clearway_sim::scenes::town;
 use clearway_sim::traffic::street;
 use tokio::time::MissedTickBehavior;
 
-use crate::base::clock::now_ns;
-use crate::config::{Config, Sender, Udp};
-use crate::encode::EncodedMap;
-use crate::encode::picture::{self, Style};
-use crate::server::{Running, Server, Setup};
+use clearway_daemon::base::clock::now_ns;
+use clearway_daemon::config::{Config, Sender, Udp};
+use clearway_daemon::encode::EncodedMap;
+use clearway_daemon::encode::picture::{self, Style};
+use clearway_daemon::run::{Running, Server, Setup};
 
 use super::car::{self, Car};
 use super::error::{DemoError, PictureError};

@@ -11,9 +11,9 @@ use std::sync::{Arc, Mutex};
 
 use clearway_lidar::revolution::Revolution;
 
-use crate::base::file_advice::advised;
-use crate::base::sync::locked;
-use crate::engine::Observer;
+use clearway_daemon::base::file_advice::advised;
+use clearway_daemon::base::sync::locked;
+use clearway_daemon::engine::Observer;
 
 /// A folder to which point clouds are written.
 #[derive(Clone, Debug)]

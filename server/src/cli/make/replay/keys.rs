@@ -6,7 +6,7 @@ use clearway_proto::v1::{ReplayControl, ReplayPhase, ReplayState};
 use tokio::runtime::Handle;
 
 use super::state::line as describe;
-use crate::replay::ReplayHandle;
+use clearway_daemon::replay::ReplayHandle;
 
 /// The keys, as they are printed at the start.
 pub const KEYS: &str = "keys, each with Enter: p pause or play, n next map, SECONDS seek, < and > 5 s back and forward, \
@@ -96,7 +96,7 @@ async fn control(replay: ReplayHandle, request: ReplayControl) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::replay::control::Command;
+    use clearway_daemon::replay::control::Command;
 
     #[test]
     fn a_step_that_waits_holds_up_no_key_after_it() {

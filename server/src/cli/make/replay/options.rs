@@ -9,13 +9,13 @@ use clearway_mapping::config::Extrinsics;
 use super::clouds::CloudError;
 use crate::cli::shared::configuration::extrinsics;
 use crate::cli::shared::model::ModelParser;
-use crate::config::ConfigError;
-use crate::ingest::files::FilesError;
-use crate::record::reader::RecordingError;
-use crate::replay::control::{ControlError, RATES};
-use crate::replay::faults::{Fault, FaultError};
-use crate::replay::outcome::PlayError;
-use crate::server::{ShutdownError, StartError};
+use clearway_daemon::config::ConfigError;
+use clearway_daemon::ingest::files::FilesError;
+use clearway_daemon::record::reader::RecordingError;
+use clearway_daemon::replay::control::{ControlError, RATES};
+use clearway_daemon::replay::faults::{Fault, FaultError};
+use clearway_daemon::replay::outcome::PlayError;
+use clearway_daemon::run::{ShutdownError, StartError};
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI, nuScenes and PCD files or folders.
 ///

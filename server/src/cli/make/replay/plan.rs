@@ -20,15 +20,15 @@ use super::record_file::check_record;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
 use crate::cli::shared::ground_revolutions::{GroundRevolutions, points_of};
-use crate::config::{Calibrations, Config, Origin, Recorder};
-use crate::ingest::files::mcap::{McapError, McapOptions};
-use crate::ingest::files::{FilesError, Kind, Readings};
-use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
-use crate::ingest::ros::decoder::PoseSource;
-use crate::record::reader::RecordingReader;
-use crate::replay::faults::Faults;
-use crate::replay::timeline::{Timeline, Track};
-use crate::server::Setup;
+use clearway_daemon::config::{Calibrations, Config, Origin, Recorder};
+use clearway_daemon::ingest::files::mcap::{McapError, McapOptions};
+use clearway_daemon::ingest::files::{FilesError, Kind, Readings};
+use clearway_daemon::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
+use clearway_daemon::ingest::ros::decoder::PoseSource;
+use clearway_daemon::record::reader::RecordingReader;
+use clearway_daemon::replay::faults::Faults;
+use clearway_daemon::replay::timeline::{Timeline, Track};
+use clearway_daemon::run::Setup;
 
 /// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
 /// roof of a car.

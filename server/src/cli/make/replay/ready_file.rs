@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 
 use super::options::ReplayError;
-use crate::server::Running;
+use clearway_daemon::run::Running;
 
 /// Greatest length of the file. Ours: it has a line for each vehicle.
 const BYTES_MAX: u64 = 1 << 20;

@@ -5,7 +5,7 @@ use std::io::Error;
 use std::path::{Path, PathBuf};
 
 use super::options::{Options, ReplayError};
-use crate::record::writer::{is_same_file, later_part_of, next_free_name, parent_of, unfinished_name};
+use clearway_daemon::record::writer::{is_same_file, later_part_of, next_free_name, parent_of, unfinished_name};
 
 /// Refuses a file of `--record` that is replayed, is no file, or may not be replaced.
 ///

@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use super::options::{Options, ReplayError};
-use crate::config::{Calibrations, Config, Vehicle};
-use crate::ingest::files::{Kind, Readings};
-use crate::record::reader::RecordingReader;
+use clearway_daemon::config::{Calibrations, Config, Vehicle};
+use clearway_daemon::ingest::files::{Kind, Readings};
+use clearway_daemon::record::reader::RecordingReader;
 
 /// A recording of this server.
 pub(super) struct Recorded {

@@ -8,8 +8,8 @@ use clearway_mapping::sensor::mount::{MountError, MountEstimate};
 use serde_json::{Map, Value, json};
 
 use crate::cli::shared::output::counted;
-use crate::ingest::files::Truncated;
-use crate::status::Snapshot;
+use clearway_daemon::ingest::files::Truncated;
+use clearway_daemon::status::Snapshot;
 
 /// Where the extrinsics of the first sensor come from.
 #[derive(Clone, Debug, PartialEq)]

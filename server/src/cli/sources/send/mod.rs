@@ -21,8 +21,8 @@ use serde_json::{Value, json};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, progress_bar};
-use crate::ingest::files::{Kind as FileKind, kind};
-use crate::record::mcap_reader::McapReader;
+use clearway_daemon::ingest::files::{Kind as FileKind, kind};
+use clearway_daemon::record::mcap_reader::McapReader;
 use udp::{Kind, Sender, Speed};
 
 #[cfg(feature = "sim")]

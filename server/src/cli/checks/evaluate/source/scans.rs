@@ -21,7 +21,7 @@ use super::pairs::Pair;
 use super::setup::{SensorSetup, pipeline};
 use super::variation::Variation;
 use super::written::{Frame, write};
-use crate::ingest::files::kitti;
+use clearway_daemon::ingest::files::kitti;
 
 /// How the sensor is mounted on KITTI's car, from KITTI's published sensor setup. The published metrics of other
 /// methods use it, and an estimate from one scan tilts with the road under it.

@@ -6,7 +6,7 @@ use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::Mount;
 
 use super::super::error::EvaluateError;
-use crate::config::Config;
+use clearway_daemon::config::Config;
 
 /// The sensor that sends the scans.
 #[derive(Clone, Debug, Default, PartialEq)]

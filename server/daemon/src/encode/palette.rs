@@ -37,7 +37,7 @@ mod tests {
 
     #[test]
     fn the_scale_has_the_colours_of_the_page() {
-        let page = include_str!("../../web/draw/palette.js");
+        let page = include_str!("../../../web/draw/palette.js");
         let line = page.lines().find(|line| line.starts_with("const STOPS")).expect("the page's colours");
         let numbers = line.split(|c: char| !c.is_ascii_digit()).filter_map(|number| number.parse::<u8>().ok());
         assert_eq!(numbers.collect::<Vec<_>>(), STOPS.as_flattened());

@@ -50,7 +50,7 @@ pub use vehicle::{Ingest, Vehicle};
 pub use zenoh::{Fleet, Ros2, Zenoh, ZenohMode};
 
 /// The commented configuration: every key with its default, the optional tables as comments.
-pub const COMMENTED: &str = include_str!("../../../deploy/clearway.toml");
+pub const COMMENTED: &str = include_str!("../../../../deploy/clearway.toml");
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` selects the
 /// factory's table.

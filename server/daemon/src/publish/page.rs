@@ -25,7 +25,7 @@ use crate::replay::ReplayHandle;
 use crate::status::{Format, prometheus, vehicle_json};
 
 #[derive(RustEmbed)]
-#[folder = "web/"]
+#[folder = "../web/"]
 struct Assets;
 
 /// What is served: the vehicles, the counts of the listeners by name, and the replay if there is one.

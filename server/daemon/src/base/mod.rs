@@ -10,8 +10,8 @@
 //! | [`held_sockets`] | sockets that systemd holds -> listeners |
 
 pub mod clock;
-pub(crate) mod counted;
+pub mod counted;
 pub mod directory;
-pub(crate) mod file_advice;
+pub mod file_advice;
 pub mod held_sockets;
-pub(crate) mod sync;
+pub mod sync;

@@ -9,9 +9,9 @@
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
-use clearway::base::held_sockets::HeldSockets;
-use clearway::config::{Config, Udp};
-use clearway::ingest::{queue::event_queue, udp};
+use clearway_daemon::base::held_sockets::HeldSockets;
+use clearway_daemon::config::{Config, Udp};
+use clearway_daemon::ingest::{queue::event_queue, udp};
 use clearway_mapping::event::Body;
 use clearway_mapping::ledger::Ledger;
 use nix::sys::socket::setsockopt;

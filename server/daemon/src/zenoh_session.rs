@@ -71,7 +71,7 @@ impl ZenohError {
 ///
 /// # Errors
 /// [`ZenohError`] if the settings are invalid or the file of `[zenoh]` cannot be read.
-pub(crate) fn settings<'a>(
+pub fn settings<'a>(
     options: &Options,
     observation_bytes_max: usize,
     vehicles: impl Iterator<Item = &'a str>,
@@ -288,7 +288,7 @@ mod tests {
     fn the_files_in_deploy_have_the_limits_of_a_server_without_a_file() {
         let limited = limited().unwrap();
         for name in ["server.json5", "router.json5"] {
-            let file = format!("{}/../deploy/zenoh/{name}", env!("CARGO_MANIFEST_DIR"));
+            let file = format!("{}/../../deploy/zenoh/{name}", env!("CARGO_MANIFEST_DIR"));
             let config = Config::from_file(&file).unwrap();
             for (key, _) in LIMITS {
                 assert_eq!(config.get_json(key).unwrap(), limited.get_json(key).unwrap(), "{name}: {key}");
@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn roles_with_and_without_a_router_are_the_same() {
         let roles = ["server.json5", "router.json5"].map(|name| {
-            let file = format!("{}/../deploy/zenoh/{name}", env!("CARGO_MANIFEST_DIR"));
+            let file = format!("{}/../../deploy/zenoh/{name}", env!("CARGO_MANIFEST_DIR"));
             Config::from_file(&file).unwrap().get_json("access_control").unwrap()
         });
         assert_eq!(roles[0], roles[1]);

@@ -36,4 +36,4 @@ pub use input::VehicleInput;
 pub use running::Running;
 pub use setup::{Setup, ShutdownError, StartError};
 pub use start::Server;
-pub(crate) use start::random;
+pub use start::random;

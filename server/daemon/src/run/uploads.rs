@@ -249,7 +249,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let options = Options { file: folder.path().join("car.mcap"), ..Options::default() };
         let (recorder, _handles) = Recorder::start(&options, &Header::default(), false).unwrap();
-        let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/drive.mcap");
+        let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/drive.mcap");
         std::fs::copy(golden, folder.path().join("car-1.part-0001.mcap")).unwrap();
         let store = Store { url: "s3://drives".into(), ..Store::default() };
         let mut uploads = Uploads::new(store, Duration::ZERO, recorder.control(), recorder.counts());
@@ -267,7 +267,7 @@ mod tests {
     async fn a_store_that_vanishes_for_an_hour_costs_an_attempt_a_minute_and_then_gets_every_part() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
-        let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/drive.mcap");
+        let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/drive.mcap");
         let add = |part: u64| _ = std::fs::copy(golden, at(&format!("car-1.part-{part:04}.mcap"))).unwrap();
         let options = Options { file: at("car.mcap"), ..Options::default() };
         let (recorder, handles) = Recorder::start(&options, &Header::default(), false).unwrap();

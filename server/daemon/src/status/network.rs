@@ -137,7 +137,8 @@ fn away_text(away: &Away, now: Instant) -> Option<String> {
     (lasts >= AWAY_NAMED_AFTER).then(text)
 }
 
-pub(crate) fn end_text(name: &str, end_s: i64, now_s: i64) -> Option<String> {
+/// Says that a certificate ends soon, or that it has ended; `None` while it is valid for long enough.
+pub fn end_text(name: &str, end_s: i64, now_s: i64) -> Option<String> {
     let left = Duration::from_secs((end_s - now_s).unsigned_abs());
     let then = "write a new one there, then SIGHUP";
     match end_s > now_s {
