@@ -6,7 +6,7 @@ mod fixture;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clearway::cli::make::replay::{Options, replay};
+use clearway::cli::replay::{Options, replay};
 use clearway_daemon::record::verify::verify;
 use clearway_lidar::model::Model;
 use clearway_sim::scanner::ScannerConfig;

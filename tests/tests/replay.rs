@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use clearway::cli::make::replay::{Mount, Options, ReplayError, Summary, describe, replay};
+use clearway::cli::replay::{Mount, Options, ReplayError, Summary, describe, replay};
 use clearway_daemon::record::verify::verify;
 
 async fn replayed(options: Options) -> Result<Summary, ReplayError> {

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use clearway::cli::make::replay::{Mount, Options, ReplayError, Summary, replay};
+use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
 use clearway_daemon::config::{Origin, Ros};
 use clearway_daemon::record::verify::verify;
 use clearway_lidar::model::Model;

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 
-use clearway::cli::make::replay::{Options, Summary, replay};
+use clearway::cli::replay::{Options, Summary, replay};
 use clearway_client::{Client, ClientError, Observation, PublicKey, Subscription, Tls, ZenohClient, now_ns};
 use clearway_daemon::config::Only;
 use clearway_daemon::run::{Running, Server, Setup};

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use clearway::cli::make::demo::rig::Rig;
-use clearway::cli::make::replay::{Options, replay};
+use clearway::cli::replay::{Options, replay};
 use clearway_daemon::config::Config;
 use clearway_daemon::encode::EncodedMap;
 use clearway_daemon::ingest::observation;

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use clearway::cli::make::replay::{Options, ReplayError, Summary, replay};
+use clearway::cli::replay::{Options, ReplayError, Summary, replay};
 use clearway_client::{Client, ClientError, MapStream, MapView, StreamEvent, Subscription};
 use clearway_daemon::encode::as_served;
 use clearway_daemon::ingest::queue::Reading;

@@ -8,7 +8,7 @@ use std::io::BufReader;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 
-use clearway::cli::make::replay::{Options, replay};
+use clearway::cli::replay::{Options, replay};
 use clearway_daemon::config::{Config, Sender, Udp};
 use clearway_daemon::ingest::queue::event_queue;
 use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};

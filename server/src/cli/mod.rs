@@ -1,24 +1,38 @@
 //! The command `clearway`: the list of its subcommands and the function that runs each.
 //!
-//! Each subcommand is one file or folder with its `Options` (as clap reads them from the command line) and its `run`:
-//!
-//! | folder | subcommands |
-//! |---|---|
-//! | [`make`] | make maps in this process: `demo`, `serve`, `replay`, `view` |
-//! | [`checks`] | check maps and configurations: `verify`, `evaluate`, `check`, `init` |
-//! | `client` | ask a running server: `watch`, `get`, `vehicles`, `status`, `top`, `recorder`, `transport` |
-//! | `archive` | read and keep files: `export`, `info`, `repair`, `upload`, `recordings` |
-//! | `sources` | send sensor data: `send`, `ingest`, `simulate` |
-//! | `completions` | a shell's name -> its completion script |
-//! | `shared` | what several subcommands share |
+//! Each subcommand is one file with its options (as clap reads them from the command line) and its `run`.
 
 mod archive;
+mod check;
 pub mod checks;
-mod client;
 mod completions;
+mod connection;
+mod drawing;
+mod fleet;
+mod get;
+mod info;
+mod ingest;
 pub mod make;
+mod recorder;
+#[cfg(feature = "store")]
+mod recordings;
+mod repair;
+pub mod replay;
+mod screen;
+mod send;
+mod serve;
+mod service_manager;
 mod shared;
 mod sources;
+mod status;
+mod top;
+mod transport;
+#[cfg(feature = "store")]
+mod upload;
+mod vehicles;
+mod verify;
+mod view;
+mod watch;
 
 use std::fmt::Write as _;
 use std::process::ExitCode;
@@ -27,20 +41,15 @@ use anyhow::Result;
 use clap::builder::StyledStr;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
-use archive::{export, info, repair};
-#[cfg(feature = "store")]
-use archive::{recordings, upload};
-use checks::{check, evaluate, init, verify};
-use client::{get, recorder, status, top, transport, vehicles, watch};
+use archive::export;
+use checks::{evaluate, init};
 #[cfg(feature = "sim")]
 use make::demo;
-use make::{replay, serve, view};
 use shared::exit::{EXIT_CODES, Exit};
 use shared::logs;
 use shared::output::{printable, with_causes};
 #[cfg(feature = "sim")]
 use sources::simulate;
-use sources::{ingest, send};
 
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]

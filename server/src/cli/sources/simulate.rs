@@ -15,10 +15,10 @@ use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 
+use crate::cli::send::udp::{self, Sender, Speed};
 use crate::cli::shared::files;
 use crate::cli::shared::model::ModelParser;
 use crate::cli::shared::output::{counted, print_line, progress_bar};
-use crate::cli::sources::send::udp::{self, Sender, Speed};
 
 /// Speed of the vehicle in the scene `street`, in m/s; as in `demo --sensors many`.
 const STREET_MPS: f64 = 8.0;

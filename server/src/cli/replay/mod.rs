@@ -26,7 +26,7 @@ use std::time::{Duration, Instant};
 use clearway_proto::v1;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::cli::make::serve::log_endpoints;
+use crate::cli::serve::log_endpoints;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, print, print_line, stop_signal, usage_error};
 use clearway_daemon::base::sync::locked;

@@ -6,9 +6,9 @@ use clearway_client::{Client, v1};
 use console::{Alignment, Style, measure_text_width, pad_str, truncate_str};
 use futures::StreamExt;
 
-use crate::cli::client::connection::{ServerOptions, explain};
-use crate::cli::client::fleet::{is_of_several_servers, server_text};
-use crate::cli::client::screen::Screen;
+use crate::cli::connection::{ServerOptions, explain};
+use crate::cli::fleet::{is_of_several_servers, server_text};
+use crate::cli::screen::Screen;
 use crate::cli::shared::output::{self, block_on, counted, stop_signal};
 
 /// Widest column of servers, in characters.

@@ -9,7 +9,7 @@ use clearway_client::{ClientError, Layer, MapView, now_ns};
 use serde_json::{Value, json};
 
 use crate::cli::archive::export::{DrawingOptions, layer_json, npy};
-use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{block_on, print_line, usage_error};

@@ -4,7 +4,7 @@ use anyhow::{Result, bail};
 use clap::Args;
 use clearway_client::v1;
 
-use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, print_line};
 use clearway_daemon::status::{State, vehicle_json};

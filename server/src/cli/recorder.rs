@@ -7,7 +7,7 @@ use clearway_proto::v1;
 use serde_json::json;
 use tonic::Code;
 
-use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
 use clearway_daemon::record::damage::utc;

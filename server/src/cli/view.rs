@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 
-use crate::cli::make::replay;
+use crate::cli::replay;
 use crate::cli::shared::exit::Exit;
 
 /// Look at recorded drives on the page: paused, with a time bar, a step and all layers.

@@ -5,9 +5,9 @@ use clap::{ArgAction, Args, Subcommand};
 use clearway_client::ClientError;
 use clearway_client::v1::{ReplayControl, ReplayState};
 
-use crate::cli::client::connection::{ServerOptions, explain};
-use crate::cli::make::replay::options::offset;
-use crate::cli::make::replay::{Speed, state};
+use crate::cli::connection::{ServerOptions, explain};
+use crate::cli::replay::options::offset;
+use crate::cli::replay::{Speed, state};
 use crate::cli::shared::output::{block_on, print_line, usage_error};
 use clearway_daemon::replay::control::STEP_MAX;
 

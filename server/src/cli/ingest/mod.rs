@@ -12,7 +12,7 @@ use clap::Args;
 use clearway_client::{Ingester, Observation, Refusal};
 use serde_json::json;
 
-use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
 use files::{FileOptions, Item, Plan};
 

@@ -9,9 +9,9 @@ use clearway_client::{ClientError, MapStream, PassedOver, Staleness, StreamEvent
 use console::truncate_str;
 use serde_json::json;
 
-use crate::cli::client::connection::{ServerOptions, explain};
-use crate::cli::client::drawing;
-use crate::cli::client::screen::Screen;
+use crate::cli::connection::{ServerOptions, explain};
+use crate::cli::drawing;
+use crate::cli::screen::Screen;
 use crate::cli::shared::exit::Exit;
 #[cfg(feature = "zenoh")]
 use crate::cli::shared::files;

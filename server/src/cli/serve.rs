@@ -4,7 +4,7 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::cli::make::service_manager;
+use crate::cli::service_manager;
 use crate::cli::shared::configuration::ConfigurationOptions;
 use crate::cli::shared::output::{block_on, stop_signal};
 use clearway_daemon::base::held_sockets::HeldSockets;

@@ -5,8 +5,8 @@ use clap::Args;
 use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
-use crate::cli::client::connection::{ServerOptions, explain};
-use crate::cli::client::fleet::{is_of_several_servers, server_text};
+use crate::cli::connection::{ServerOptions, explain};
+use crate::cli::fleet::{is_of_several_servers, server_text};
 use crate::cli::shared::output::{block_on, counted, print_line};
 use clearway_daemon::status::vehicle_json;
 
