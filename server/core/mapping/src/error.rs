@@ -2,8 +2,8 @@
 
 use clearway_lidar::DatagramError;
 
-use crate::config::check::ConfigValueError;
 use crate::road::RoadError;
+use crate::value_check::ConfigValueError;
 
 /// Latest stamp that is accepted: the year 2116, in ns since the Unix epoch. Ours: half of what an `i64` holds, so that
 /// differences and sums of two stamps do not overflow. The earliest is 0.

@@ -14,10 +14,6 @@
 
 use std::collections::BTreeMap;
 
-use clearway_lidar::telemetry::TELEMETRY_LENGTH;
-
-use crate::event::{Body, Event};
-
 /// When an event arrived, in two clocks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct EventTime {
@@ -42,10 +38,10 @@ pub(crate) struct EventClock {
 }
 
 impl EventClock {
-    /// Advances the clock to the arrival of the next event and returns its time.
-    pub fn advance(&mut self, event: &Event) -> EventTime {
-        let arrival_ns = event.arrival_ns;
-        let before_ns = self.lanes.insert((event.source, lane(&event.body)), arrival_ns);
+    /// Advances the clock to the arrival of the next event and returns its time. `lane` is the source of the event and
+    /// [`crate::event::Body::lane`].
+    pub fn advance(&mut self, arrival_ns: i64, lane: (u16, u8)) -> EventTime {
+        let before_ns = self.lanes.insert(lane, arrival_ns);
         let latest = self.latest.get_or_insert(EventTime { arrival_ns, event_ns: 0 });
         let step_ns = arrival_ns.saturating_sub(latest.arrival_ns);
         let is_set_back = before_ns.is_some_and(|before_ns| arrival_ns < before_ns) || step_ns < -LATE_NS_MAX;
@@ -57,19 +53,6 @@ impl EventClock {
     }
 }
 
-/// Number of the kind of a body whose events arrive in order.
-fn lane(body: &Body) -> u8 {
-    match body {
-        // A sensor's packets and its telemetry may come from two sockets.
-        Body::Datagram(payload) if payload.len() == TELEMETRY_LENGTH => 0,
-        Body::Datagram(_) => 1,
-        Body::Scan(_) => 2,
-        Body::EgoPose(_) => 3,
-        Body::Road(_) => 4,
-        Body::Sensor(_) | Body::Withdrawn | Body::Lost { .. } | Body::End => 5,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -77,9 +60,8 @@ mod tests {
     const MS: i64 = 1_000_000;
 
     fn advance(clock: &mut EventClock, source: u16, arrival_ms: i64) -> i64 {
-        let event = Event { sequence: 0, arrival_ns: arrival_ms * MS, source, body: Body::Datagram("abc".into()) };
-        let now = clock.advance(&event);
-        assert_eq!(now.arrival_ns, event.arrival_ns);
+        let now = clock.advance(arrival_ms * MS, (source, 1));
+        assert_eq!(now.arrival_ns, arrival_ms * MS);
         now.event_ns / MS
     }
 

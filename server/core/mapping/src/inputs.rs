@@ -6,16 +6,16 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
-use crate::config::sensor::SensorConfig;
-use crate::config::vehicle::VehicleConfig;
+use crate::config::VehicleConfig;
 use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::{Body, EgoPose, Event, Road};
 use crate::event_time::EventTime;
-use crate::layer::ScanExtras;
-use crate::reference_sensor::ReferenceChoice;
+use crate::fusion::reference_sensor::ReferenceChoice;
 use crate::road::{self, Roads};
+use crate::sensor::config::SensorConfig;
 use crate::sensor::motion::Motion;
 use crate::sensor::pipeline::SensorPipeline;
+use crate::sensor::rays::ScanExtras;
 use crate::sensor::scan::SensorScan;
 use crate::sensor::self_filter::RemovedPoints;
 

@@ -11,19 +11,20 @@
 //! | [`road`] | RDDF and RNDF files, road events -> the newest checked roads |
 //! | [`ledger`] | every event and its outcome -> counts |
 //! | [`error`] | why an event is refused |
-//! | `reference_sensor` | the sensors, their first scans -> the one whose scans make the maps |
-//! | `fusion` | the newest scans of all sensors -> the points of one map |
+//! | `fusion` | the newest scans of all sensors -> the points of one map; the reference sensor |
 //! | [`memory`] | the points of earlier maps -> the points that the newest map lacks |
 //! | [`ground`] | the points of one map -> height of the local ground, shared by all layers |
 //! | [`reach`] | the points of one map and their ground -> obstacles, and what the vehicle can reach |
 //! | [`layer`] | the points of one map -> one layer for each of the six maps |
 //! | [`map`] | what a map contains |
+//! | `azimuth_columns`, `value_check` | position -> column of azimuth; value of a key -> error |
 //! | [`vehicle_outline`] | the vehicle, seen from above |
 //! | [`scan_file`] | KITTI `.bin`, nuScenes `.pcd.bin`, `.pcd` -> scan |
 
 // The core is pure: server/core/clippy.toml lists what it must not use.
 #![deny(clippy::disallowed_methods, clippy::disallowed_types)]
 
+mod azimuth_columns;
 pub mod config;
 pub mod error;
 pub mod event;
@@ -38,8 +39,8 @@ mod map_ground;
 pub mod memory;
 pub mod pipeline;
 pub mod reach;
-mod reference_sensor;
 pub mod road;
 pub mod scan_file;
 pub mod sensor;
+mod value_check;
 pub mod vehicle_outline;

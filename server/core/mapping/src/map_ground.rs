@@ -7,10 +7,10 @@ use nalgebra::{Isometry3, Point3};
 
 use crate::ground::Ground;
 use crate::ground::config::Variant;
-use crate::layer::Rays;
 use crate::layer::registry::MapsConfig;
 use crate::memory::{Memory, MemoryState};
 use crate::reach::Reach;
+use crate::sensor::rays::Rays;
 use crate::sensor::scan::SensorScan;
 use crate::sensor::sweep::Sweep;
 

@@ -12,6 +12,7 @@ use crate::config::{ConfigValueError, MapsConfig, VehicleConfig};
 use crate::error::EventError;
 use crate::event::{Body, EgoPose, Event};
 use crate::event_time::{EventClock, EventTime};
+use crate::fusion::reference_sensor::ReferenceChoice;
 use crate::fusion::{Fusion, MergedScans};
 use crate::ground::Ground;
 use crate::inputs::Inputs;
@@ -20,7 +21,6 @@ use crate::layer::registry::Layers;
 use crate::ledger::{Ledger, Ledgers};
 use crate::map::{ElevationSource, Map};
 use crate::map_ground::MapGround;
-use crate::reference_sensor::ReferenceChoice;
 use crate::sensor::mount::check::MountDeviation;
 use crate::sensor::pipeline::SensorPipeline;
 use crate::sensor::sweep::Sweep;
@@ -139,7 +139,7 @@ impl Pipeline {
 
     /// True if the event completed a map.
     fn apply(&mut self, event: &Event) -> Result<bool, EventError> {
-        let now = self.clock.advance(event);
+        let now = self.clock.advance(event.arrival_ns, (event.source, event.body.lane()));
         let outcome = self.inputs.apply(event, now);
         self.ledgers.record(event, &outcome);
         let completed = outcome?.completed_scan.map(|_| event.source);

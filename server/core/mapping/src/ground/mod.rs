@@ -22,7 +22,7 @@ pub mod surface;
 
 use nalgebra::{Isometry3, Point3};
 
-use crate::layer::radial_grid::floor_to_whole;
+use crate::azimuth_columns::floor_to_whole;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 

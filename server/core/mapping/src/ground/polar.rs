@@ -7,7 +7,7 @@
 
 use std::f32::consts::TAU;
 
-use crate::layer::radial_grid::{AzimuthColumns, floor_to_whole};
+use crate::azimuth_columns::{AzimuthColumns, floor_to_whole};
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 

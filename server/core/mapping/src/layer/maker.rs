@@ -13,6 +13,7 @@ use crate::layer::radial_points::{RadialPoints, RadialSize};
 use crate::memory::MemoryState;
 use crate::reach::{Reach, ReachCell};
 use crate::road::StoredRoad;
+use crate::sensor::rays::{Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
 /// One named grid of a map, with its channels.
@@ -130,40 +131,6 @@ impl<'a> Context<'a> {
             }
         }
     }
-}
-
-/// The rays of one sensor's scan, for layers that collect evidence between two maps.
-#[derive(Clone, Copy, Debug)]
-pub struct Rays<'a> {
-    /// Index of the sensor in the vehicle's configuration.
-    pub sensor: u16,
-    /// End of the scan, ns since the Unix epoch. "Ego frame" below means the ego frame at this stamp.
-    pub stamp_ns: i64,
-    /// The returns, ego frame.
-    pub returns: &'a Sweep,
-    /// Height of each return over the ground, metres; NaN for a return that may be ground where no ground is known.
-    pub heights_m: &'a [f32],
-    /// Position of the sensor, ego frame, metres.
-    pub origin_m: [f32; 3],
-    /// Height of the sensor over the ground under it, metres.
-    pub origin_height_m: f32,
-    /// Directions (unit vectors, ego frame) of rays without a return; empty if the sensor does not report them.
-    pub no_returns: &'a [[f32; 3]],
-    /// Ego frame in the world frame at `stamp_ns`; `None` if no pose is near enough.
-    pub map_from_ego: Option<Isometry3<f64>>,
-    /// Forward speed, m/s, if known.
-    pub speed_mps: Option<f64>,
-}
-
-/// Optional data of a sensor's scan and of a map. The pipeline computes it only if an active layer uses it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ScanExtras {
-    /// The local ground and what the vehicle can reach ([`Context::ground`], [`Context::reach`]).
-    pub ground: bool,
-    /// Range deviations of the distance series of all sensors ([`Sweep::deviation`]).
-    pub deviations: bool,
-    /// Directions of the rays without a return ([`Rays::no_returns`]).
-    pub no_returns: bool,
 }
 
 /// A copy of a maker of which only the trait is known.

@@ -38,4 +38,6 @@ pub mod terrain;
 pub use channel::{CellType, Cells, Channel, TypedChannel};
 pub use class::{ClassInfo, Meaning};
 pub use grid::Geometry;
-pub use maker::{Context, Layer, LayerMaker, Rays, SafePoint, ScanExtras};
+pub use maker::{Context, Layer, LayerMaker, SafePoint};
+
+pub use crate::sensor::rays::Rays;

@@ -5,14 +5,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check};
-use crate::config::motion::MotionConfig;
 use crate::ground::config::GroundConfig;
 use crate::layer::drivability::Drivability;
 use crate::layer::drivability::config::DrivabilityConfig;
 use crate::layer::height_difference::HeightDifference;
 use crate::layer::height_difference::config::HeightDifferenceConfig;
-use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
+use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::layer::occupancy::Occupancy;
 use crate::layer::occupancy::config::OccupancyConfig;
 use crate::layer::radial_points::RadialPoints;
@@ -24,7 +22,10 @@ use crate::layer::terrain::Terrain;
 use crate::layer::terrain::config::TerrainConfig;
 use crate::memory::config::MemoryConfig;
 use crate::reach::config::ReachConfig;
+use crate::sensor::motion::MotionConfig;
+use crate::sensor::rays::{Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
+use crate::value_check::{ConfigValueError, check};
 
 /// Creates the maker of one layer; `None` if the configuration disables the layer.
 type Create = fn(&MapsConfig) -> Option<Box<dyn LayerMaker>>;

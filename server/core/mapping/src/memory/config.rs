@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_each};
+use crate::value_check::{ConfigValueError, check_each};
 
 /// Parameters of the memory of ground ([`crate::memory`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

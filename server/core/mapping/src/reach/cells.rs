@@ -1,6 +1,6 @@
 //! The square cells of the reach stage.
 
-use crate::layer::radial_grid::floor_to_whole;
+use crate::azimuth_columns::floor_to_whole;
 
 /// Side of a cell, metres. Ours: the cells of Seo 2014.
 pub const CELL_M: f32 = 0.25;

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_each, check_fits};
+use crate::value_check::{ConfigValueError, check_each, check_fits};
 use crate::vehicle_outline::Outline;
 
 /// The vehicle's outline, and what it cannot drive over or under.

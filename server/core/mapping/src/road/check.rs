@@ -1,6 +1,6 @@
 //! Checks of roads, and the error they give.
 
-use crate::event::Road;
+use crate::road::Road;
 
 /// Greatest number of points of one road. Ours: the route of the Grand Challenge of 2004 has 2586.
 pub const POINTS_MAX: usize = 65_536;

@@ -1,7 +1,7 @@
 //! Roads: checked when they arrive, kept until the next one, and transformed into the ego frame of each map.
 //!
-//! In: [`crate::event::Road`] events, or the text of a route or lane file. Out: points and widths for
-//! [`crate::layer::speed`]. A road is one strip; the newest road of each purpose is used.
+//! In: [`Road`] events, or the text of a route or lane file. Out: points and widths for
+//! the layer `speed`. A road is one strip; the newest road of each purpose is used.
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -23,3 +23,42 @@ pub use check::{POINTS_MAX, RoadError, check};
 pub use line::{FOOT_M, LineError};
 pub use local_frame::LocalFrame;
 pub use store::{Roads, StoredRoad};
+
+/// A road: points along its middle, and its width at each. [`check`](check()) states what is allowed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Road {
+    /// Time at which the road was seen or read, ns since the Unix epoch. The ego frame of the points is the one of this
+    /// stamp.
+    pub stamp_ns: i64,
+    /// What the road is used for.
+    pub purpose: RoadPurpose,
+    /// Frame of the points.
+    pub frame: RoadFrame,
+    /// Points x, y, metres, in driving order.
+    pub points: Vec<[f64; 2]>,
+    /// Whole width at each point, metres.
+    pub widths_m: Vec<f64>,
+    /// Votes for each dominant orientation in the detector's image; empty if the road was not found in an image.
+    pub orientations: Vec<f32>,
+    /// Speed limit from each point to the next one, m/s; 0: no limit. Empty if the road has no limits.
+    pub speed_limits_mps: Vec<f64>,
+}
+
+/// What a road is used for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RoadPurpose {
+    /// A detected road or a lane: it is painted into the speed map, and replaces the one before.
+    Paint,
+    /// The centre line of the route (RDDF): it is never painted. Its curvature shows where a detector fails; its width
+    /// is the corridor in which roads are painted; its limits cap the speed.
+    Route,
+}
+
+/// Frame of a road's points.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RoadFrame {
+    /// The ego frame at the road's stamp.
+    Ego,
+    /// The locally fixed world frame. The road is not used until an ego pose is known.
+    Map,
+}

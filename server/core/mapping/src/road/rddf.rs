@@ -4,9 +4,9 @@
 //! degrees, feet and miles an hour. Out: [`Rddf`], and from it the centre line as a [`Road`] in the map frame. A row
 //! that cannot be read is left out and reported; the other rows are used. `#` begins a comment.
 
-use crate::event::{Road, RoadFrame, RoadPurpose};
 use crate::road::line::{FOOT_M, LineError, latitude, longitude, number};
 use crate::road::local_frame::LocalFrame;
+use crate::road::{Road, RoadFrame, RoadPurpose};
 
 /// One mile an hour in metres a second.
 const MPH_MPS: f64 = 0.447_04;

@@ -5,9 +5,9 @@
 //! reported; the others are used. Exits, stops, checkpoints and zones do not change the shape of a lane and are
 //! ignored.
 
-use crate::event::{Road, RoadFrame, RoadPurpose};
 use crate::road::line::{FOOT_M, LineError, latitude, longitude, number};
 use crate::road::local_frame::LocalFrame;
+use crate::road::{Road, RoadFrame, RoadPurpose};
 
 /// The lanes of a road network.
 #[derive(Clone, Debug, Default, PartialEq)]

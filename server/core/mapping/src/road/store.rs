@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Point3};
 
-use crate::event::{Road, RoadFrame, RoadPurpose};
+use crate::road::{Road, RoadFrame, RoadPurpose};
 
 /// A checked road, and the pose of the vehicle at its stamp.
 #[derive(Clone, Debug, PartialEq)]

@@ -6,8 +6,8 @@
 
 use super::error::{BinDoubt, ScanFileError};
 use super::format::{POINTS_MAX, ScanFormat, complete_rings};
-use crate::config::sensor::RINGS_MAX;
-use crate::event::Scan;
+use crate::sensor::config::RINGS_MAX;
+use crate::sensor::observation::Scan;
 
 /// Greatest coordinate of a point, metres. Ours, as of all positions: no sensor of the family reaches half as far.
 const COORDINATE_M_MAX: f32 = 1000.0;

@@ -1,6 +1,6 @@
 //! The formats of scan files, and what all of them have in common.
 
-use crate::event::Scan;
+use crate::sensor::observation::Scan;
 use crate::sensor::rings;
 
 /// Greatest number of points of a scan file. Ours: no sensor returns more in one revolution. A header that states more

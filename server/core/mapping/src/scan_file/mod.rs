@@ -19,7 +19,7 @@ mod format;
 mod lzf;
 mod pcd;
 
-use crate::event::Scan;
+use crate::sensor::observation::Scan;
 
 pub use bin::read_bin;
 pub use error::{BinDoubt, ScanFileError};

@@ -3,7 +3,7 @@
 use super::error::ScanFileError;
 use super::format::{POINTS_MAX, complete_rings};
 use super::lzf;
-use crate::event::Scan;
+use crate::sensor::observation::Scan;
 
 /// Names of the fields that state a point's laser, the best first.
 const RING_FIELDS: [&str; 4] = ["ring", "channel", "laser", "laser_id"];

@@ -10,20 +10,25 @@
 //! | [`deviation`] | deviation of a range -> whole number |
 //! | [`distance_series`] | revolution -> how far each range deviates from its laser's neighbouring ranges |
 //! | [`ring_series`] | scan with rings -> the same for each of its points |
-//! | `no_returns` | revolution -> directions of the rays without a return |
+//! | [`rays`] | revolution -> directions of the rays without a return; what layers read |
+//! | `state` | what a map states about a sensor |
+//! | `observation`, `config` | a scan, an ego pose; the table `[[vehicle.sensor]]` |
 //! | `model_check` | scan, configured model -> error if the scan cannot be one of it |
 //! | `rings` | scan -> elevations of the lasers, rings of the points |
 //! | [`mount`] | revolutions -> height, pitch and roll of a sensor; scans -> the ground's deviation from its mount |
 
+pub(crate) mod config;
 pub mod deviation;
 pub mod distance_series;
 mod model_check;
 pub mod motion;
 pub mod mount;
-mod no_returns;
+pub(crate) mod observation;
 pub(crate) mod pipeline;
+pub mod rays;
 pub mod ring_series;
 pub(crate) mod rings;
 pub(crate) mod scan;
 pub mod self_filter;
+pub(crate) mod state;
 pub mod sweep;

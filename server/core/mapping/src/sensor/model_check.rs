@@ -6,7 +6,7 @@
 use clearway_lidar::Model;
 
 use crate::error::EventError;
-use crate::event::Scan;
+use crate::sensor::observation::Scan;
 
 /// How far outside of the model's elevations a point may lie, degrees. Ours: the lasers of a unit differ from the
 /// nominal ones by less, and a sender that compensates the motion of the vehicle turns points by less.

@@ -12,22 +12,22 @@ use clearway_lidar::{CalibrationSource, Model, Sensor, SensorStatus};
 
 use nalgebra::Vector3;
 
-use crate::config::body::BodyConfig;
-use crate::config::sensor::SensorConfig;
 use crate::error::{EventError, check_newer, check_stamp_range};
-use crate::event::Scan;
 use crate::event_time::EventTime;
-use crate::layer::ScanExtras;
-use crate::map::{Contribution, ElevationSource, SensorState};
+use crate::sensor::config::SensorConfig;
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::model_check;
 use crate::sensor::motion::{EgoTrajectory, Motion};
 use crate::sensor::mount::check::{MountCheck, MountDeviation};
-use crate::sensor::no_returns::{find_no_returns, rotated};
+use crate::sensor::observation::Scan;
+use crate::sensor::rays::ScanExtras;
+use crate::sensor::rays::{find_no_returns, rotated};
 use crate::sensor::ring_series::RingSeries;
 use crate::sensor::rings;
 use crate::sensor::scan::SensorScan;
+use crate::sensor::self_filter::BodyConfig;
 use crate::sensor::self_filter::{RemovedPoints, SelfFilter};
+use crate::sensor::state::{Contribution, ElevationSource, SensorState};
 use crate::sensor::sweep::Mount;
 
 /// Squared length of a no-return direction. Ours: senders round to single precision or coarser, and an error of a

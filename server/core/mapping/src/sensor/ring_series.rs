@@ -7,8 +7,8 @@
 //! at the two ends of the ring it is the mean of those that exist. A point at the azimuth of the point before is a
 //! second echo of the same ray; it is not part of the series.
 
-use crate::event::Scan;
 use crate::sensor::distance_series::REACH;
+use crate::sensor::observation::Scan;
 use crate::sensor::sweep::classify;
 
 /// Least difference between the azimuths of two rays, radians. Ours: a fiftieth of the finest azimuth step of the

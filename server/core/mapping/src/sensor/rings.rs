@@ -11,8 +11,8 @@ use std::f32::consts::{PI, TAU};
 
 use clearway_lidar::calibration::{Calibration, LaserCalibration};
 
-use crate::config::sensor::RINGS_MAX;
-use crate::event::Scan;
+use crate::sensor::config::RINGS_MAX;
+use crate::sensor::observation::Scan;
 use crate::sensor::sweep::classify;
 
 /// Least number of rings that are found in a scan without rings. Ours: a rotating sensor has at least 16, and some of

@@ -5,9 +5,9 @@
 use nalgebra::Isometry3;
 
 use crate::event_time::EventTime;
-use crate::layer::Rays;
-use crate::map::SensorState;
 use crate::sensor::motion::Compensation;
+use crate::sensor::rays::Rays;
+use crate::sensor::state::SensorState;
 use crate::sensor::sweep::Sweep;
 
 /// The newest scan of one sensor, made from a revolution of its firings or from a scan event.

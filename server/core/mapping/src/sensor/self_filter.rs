@@ -4,7 +4,43 @@
 //! it, if there is one: it lies on the vehicle, its ray crosses the vehicle, or it lies in a blind sector. A ray that
 //! crosses the vehicle was reflected by its paint or glass, and its return is a mirror image.
 
-use crate::config::body::BodyConfig;
+use serde::{Deserialize, Serialize};
+
+use crate::value_check::{ConfigValueError, check};
+
+/// The box around the vehicle, ego frame; the table `[vehicle.body]`. It has no lower end: what is under the vehicle belongs to it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BodyConfig {
+    /// Rear end, metres forward of the ego origin.
+    pub x_m_min: f32,
+    /// Front end, metres forward of the ego origin.
+    pub x_m_max: f32,
+    /// Right side, metres to the left of the ego origin.
+    pub y_m_min: f32,
+    /// Left side, metres to the left of the ego origin.
+    pub y_m_max: f32,
+    /// Top, metres over the ground.
+    pub z_m_max: f32,
+}
+
+impl BodyConfig {
+    pub(crate) fn validate(&self) -> Result<(), ConfigValueError> {
+        let at = |key: &str| format!("vehicle.body.{key}");
+        for (key, value) in
+            [("x_m_min", self.x_m_min), ("x_m_max", self.x_m_max), ("y_m_min", self.y_m_min), ("y_m_max", self.y_m_max)]
+        {
+            check(f64::from(value), -20.0..=20.0, || at(key), "-20 to 20")?;
+        }
+        check(f64::from(self.z_m_max), 0.0..=20.0, || at("z_m_max"), "0 to 20")?;
+        for (key, least, most) in [("x_m_max", self.x_m_min, self.x_m_max), ("y_m_max", self.y_m_min, self.y_m_max)] {
+            if least >= most {
+                return Err(ConfigValueError::new(at(key), most, "more than the one before"));
+            }
+        }
+        Ok(())
+    }
+}
 
 /// Why the self filter removes a return.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,7 +85,7 @@ pub struct SelfFilter {
 
 impl SelfFilter {
     /// The filter of a sensor at `sensor_m`, ego frame, metres, with these blind sectors
-    /// ([`crate::config::SensorConfig::blind_deg`]); `None` if there is nothing to filter.
+    /// ([`crate::sensor::config::SensorConfig::blind_deg`]); `None` if there is nothing to filter.
     pub fn new(body: Option<&BodyConfig>, sensor_m: [f32; 3], blind_deg: &[[f32; 2]]) -> Option<Self> {
         let body = body.map(|body| Body::new(body, sensor_m));
         let blind: Vec<_> = blind_deg.iter().map(|ends| Sector::new(*ends)).collect();

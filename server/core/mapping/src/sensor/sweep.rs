@@ -11,10 +11,10 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
-use crate::event::Scan;
 use crate::sensor::deviation::Deviation;
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{ScanKnots, knots};
+use crate::sensor::observation::Scan;
 use crate::sensor::self_filter::{FilterReason, RemovedPoints, SelfFilter};
 
 /// Greatest coordinate of a position, metres. Ours: no sensor of the family reaches half as far.

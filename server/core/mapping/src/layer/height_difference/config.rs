@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_columns, check_each};
+use crate::value_check::{ConfigValueError, check_columns, check_each};
 
 /// Parameters of the layer `height_difference`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -10,8 +10,9 @@ pub mod config;
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
-use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
+use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::layer::radial_points::{RadialPoints, RadialSize};
+use crate::sensor::rays::ScanExtras;
 use crate::sensor::sweep::Sweep;
 
 use class::{DIFFERENCE, HeightDifferenceClass};

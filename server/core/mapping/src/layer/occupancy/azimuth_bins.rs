@@ -4,7 +4,7 @@
 
 use std::ops::Range;
 
-use crate::layer::radial_grid::AzimuthColumns;
+use crate::azimuth_columns::AzimuthColumns;
 
 /// Number of azimuth bins around a sensor. Ours: a quarter of a degree each; not tuned.
 pub const BINS: usize = 1440;

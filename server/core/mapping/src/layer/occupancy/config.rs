@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_cells, check_each, check_fits};
+use crate::value_check::{ConfigValueError, check_cells, check_each, check_fits};
 
 use super::flicker::MAPS_MAX;
 

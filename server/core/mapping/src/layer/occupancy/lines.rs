@@ -9,7 +9,7 @@
 //! Lines only set bits, so that their order does not matter. As in the other variant, only the newest scan of a sensor
 //! shows what is clear and what is hidden now.
 
-use crate::layer::maker::Rays;
+use crate::sensor::rays::Rays;
 
 use super::config::OccupancyConfig;
 use super::states::{HIDDEN, LOOKED_AT, THROUGH};

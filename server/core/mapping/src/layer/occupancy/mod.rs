@@ -44,7 +44,8 @@ pub mod window;
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::count_cells;
 use crate::layer::grid::Geometry;
-use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
+use crate::layer::maker::{Context, Layer, LayerMaker};
+use crate::sensor::rays::{Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
 use class::{HITS, OccupancyClass};

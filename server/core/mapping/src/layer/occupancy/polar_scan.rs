@@ -21,8 +21,8 @@
 //! Only the newest scan of a sensor shows what is clear and what is hidden now. Therefore rays are traced once for each
 //! map, independent of the number of scans since the last one.
 
-use crate::layer::maker::Rays;
-use crate::layer::radial_grid::{floor_to_whole, round_to_whole};
+use crate::azimuth_columns::{floor_to_whole, round_to_whole};
+use crate::sensor::rays::Rays;
 
 use super::azimuth_bins::{AzimuthBins, BINS, around, neighbour};
 use super::bits::{any_bit, bits_of_word, set_bits};

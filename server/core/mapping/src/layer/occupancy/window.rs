@@ -10,7 +10,7 @@ use nalgebra::Isometry3;
 
 use super::config::Hits;
 use super::states::{Cell, evidence};
-use crate::layer::radial_grid::floor_to_whole;
+use crate::azimuth_columns::floor_to_whole;
 
 /// Bit of a cell whose other bits are its state, not evidence. It is above all evidence bits.
 const STATE: u8 = 8;

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_cells, check_each};
+use crate::value_check::{ConfigValueError, check_cells, check_each};
 
 /// Parameters of the layer `safe_path`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

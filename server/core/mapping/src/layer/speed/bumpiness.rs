@@ -11,8 +11,8 @@
 //! Heights are summed in whole millimetres, so that the order of the points does not matter. Points far below the
 //! ground are mirror images and are left out.
 
+use crate::azimuth_columns::floor_to_whole;
 use crate::layer::maker::Context;
-use crate::layer::radial_grid::floor_to_whole;
 use crate::layer::roughness::NOWHERE;
 use crate::sensor::sweep::Sweep;
 

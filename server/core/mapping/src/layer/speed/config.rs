@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_cells, check_each, check_fits};
+use crate::value_check::{ConfigValueError, check_cells, check_each, check_fits};
 
 /// Parameters of the layer `speed`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -28,7 +28,8 @@ pub mod rough_ground;
 
 use crate::layer::channel::TypedChannel;
 use crate::layer::grid::Geometry;
-use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
+use crate::layer::maker::{Context, Layer, LayerMaker};
+use crate::sensor::rays::ScanExtras;
 use crate::sensor::sweep::Sweep;
 
 use bumpiness::{HeightMap, OBSTACLE_BUMPINESS};

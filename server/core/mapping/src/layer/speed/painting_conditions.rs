@@ -7,8 +7,8 @@
 //! more than the detector can follow. Two are ours, because the system has clocks and frames: (3) the road was detected
 //! too long ago; (4) it lies in the map frame and no pose is known.
 
-use crate::event::RoadFrame;
 use crate::layer::maker::Context;
+use crate::road::RoadFrame;
 
 use super::config::SpeedConfig;
 

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_each};
+use crate::value_check::{ConfigValueError, check_each};
 
 use super::division::Division;
 

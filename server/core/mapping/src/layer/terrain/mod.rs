@@ -34,7 +34,8 @@ pub mod regions;
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::{count_cells, drivable_share};
 use crate::layer::grid::Geometry;
-use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
+use crate::layer::maker::{Context, Layer, LayerMaker};
+use crate::sensor::rays::ScanExtras;
 use crate::sensor::sweep::Sweep;
 
 use class::{PLANE, ROUGHNESS, SHAPE, TerrainClass};

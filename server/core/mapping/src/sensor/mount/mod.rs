@@ -22,7 +22,7 @@ mod plane;
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use crate::config::sensor::Extrinsics;
+use crate::sensor::config::Extrinsics;
 use median::{weighted_median, weighted_std};
 use plane::{PlaneError, PlaneEstimate};
 

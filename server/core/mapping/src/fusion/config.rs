@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check};
+use crate::value_check::{ConfigValueError, check};
 
 /// Parameters of [`crate::fusion`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

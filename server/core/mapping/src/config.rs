@@ -1,15 +1,45 @@
-//! The table `[vehicle]`.
-
-use serde::{Deserialize, Serialize};
+//! One vehicle's sensors and maps, as the configuration file states them. Keys contain their units; unknown keys are
+//! refused.
+//!
+//! In: the tables of the file. Out: the same as values, checked by [`VehicleConfig::validate`], whose errors name the
+//! key, its value and what is allowed. Lengths are in metres. Angles are in degrees here, and in radians in all other
+//! modules.
+//!
+//! Each stage owns its table; this module has the tables of the whole vehicle, and names those of the stages.
+//!
+//! | table | where |
+//! |---|---|
+//! | `[vehicle]`, `[vehicle.time]` | here |
+//! | `[[vehicle.sensor]]` | [`crate::sensor`], `config` |
+//! | `[vehicle.body]` | [`crate::sensor::self_filter`] |
+//! | `[vehicle.fusion]` | `fusion`, `config` |
+//! | `[vehicle.maps.motion]` | [`crate::sensor::motion`] |
+//! | `[vehicle.maps.memory]` | [`crate::memory`] |
+//! | `[vehicle.maps.ground]` | [`crate::ground`] |
+//! | `[vehicle.maps.reach]` | [`crate::reach`] |
+//! | `[vehicle.maps]`, and one table for each layer | [`crate::layer`], in the layer's folder |
 
 use clearway_lidar::calibration::Calibration;
+use clearway_lidar::clock::AHEAD_NS_MAX;
+use serde::{Deserialize, Serialize};
 
-use crate::config::body::BodyConfig;
-use crate::config::check::{ConfigValueError, check_name};
-use crate::config::fusion::FusionConfig;
-use crate::config::sensor::SensorConfig;
-use crate::config::time::TimeConfig;
-use crate::layer::registry::MapsConfig;
+use crate::value_check::check_name;
+
+pub use crate::fusion::config::FusionConfig;
+pub use crate::ground::config::{GroundConfig, Variant as GroundVariant};
+pub use crate::layer::drivability::config::{DrivabilityConfig, DrivabilityVariant, Passage, PlaneTest, Seed};
+pub use crate::layer::height_difference::config::HeightDifferenceConfig;
+pub use crate::layer::occupancy::config::{Hits, OccupancyConfig, OccupancyVariant};
+pub use crate::layer::registry::MapsConfig;
+pub use crate::layer::safe_path::config::SafePathConfig;
+pub use crate::layer::speed::config::{Bonus, SpeedConfig};
+pub use crate::layer::terrain::config::{TerrainConfig, Variant};
+pub use crate::memory::config::MemoryConfig;
+pub use crate::reach::config::ReachConfig;
+pub use crate::sensor::config::{BLIND_MAX, Extrinsics, RINGS_MAX, SensorConfig};
+pub use crate::sensor::motion::MotionConfig;
+pub use crate::sensor::self_filter::BodyConfig;
+pub use crate::value_check::ConfigValueError;
 
 /// Greatest number of sensors of one vehicle, declared ones included. Ours: the newest scan of each takes some
 /// megabytes.
@@ -116,6 +146,44 @@ impl VehicleConfig {
         match self.sensors.iter().take(index).any(|before| before.name == sensor.name) {
             true => Err(ConfigValueError::new(at + ".name", &sensor.name, "each sensor its own")),
             false => Ok(()),
+        }
+    }
+}
+
+const NS_PER_MS: i64 = 1_000_000;
+/// Greatest value of `ahead_ms_max`. Ours: a minute ahead, no map is of use to a planner.
+const AHEAD_MS_MAX: u32 = 60_000;
+
+/// How the stamps of sensors follow the clocks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TimeConfig {
+    /// Greatest time by which stamps may be ahead of the clock that they follow, milliseconds. If they are ahead by
+    /// more, they go back to it and a new epoch begins, which the map states. 0: stamps never go back, and epochs are
+    /// not counted.
+    pub ahead_ms_max: u32,
+}
+
+impl Default for TimeConfig {
+    fn default() -> Self {
+        Self { ahead_ms_max: (AHEAD_NS_MAX / NS_PER_MS) as u32 }
+    }
+}
+
+impl TimeConfig {
+    /// The rules of recordings that were made before there was this table.
+    pub const WITHOUT_EPOCHS: Self = Self { ahead_ms_max: 0 };
+
+    /// [`TimeConfig::ahead_ms_max`] in ns.
+    pub fn ahead_ns_max(&self) -> i64 {
+        i64::from(self.ahead_ms_max) * NS_PER_MS
+    }
+
+    pub(crate) fn validate(&self) -> Result<(), ConfigValueError> {
+        let allowed = "0 (stamps never go back), or 20 to 60000";
+        match self.ahead_ms_max {
+            0 | 20..=AHEAD_MS_MAX => Ok(()),
+            other => Err(ConfigValueError::new("vehicle.time.ahead_ms_max", other, allowed)),
         }
     }
 }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use clearway_lidar::calibration::{Calibration, CalibrationError};
 use clearway_lidar::model::Model;
 
-use crate::config::check::{ConfigValueError, check, check_name};
+use crate::value_check::{ConfigValueError, check, check_name};
 
 /// Greatest length of a calibration that a declared sensor brings, bytes. Ours: half as much again as the longest table
 /// of any model, that of a VLS-128.

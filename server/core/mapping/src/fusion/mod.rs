@@ -20,13 +20,16 @@
 //! The order in which the scans of different sensors arrive between two maps does not change the layers that are made
 //! from the sweep.
 
+pub(crate) mod config;
+pub(crate) mod reference_sensor;
+
 use nalgebra::Isometry3;
 
-use crate::config::fusion::FusionConfig;
 use crate::event_time::EventTime;
-use crate::map::{Contribution, SensorState};
+use crate::fusion::config::FusionConfig;
 use crate::sensor::motion::{Compensation, Motion};
 use crate::sensor::scan::SensorScan;
+use crate::sensor::state::{Contribution, SensorState};
 use crate::sensor::sweep::Sweep;
 
 const NS_PER_MS: i64 = 1_000_000;
