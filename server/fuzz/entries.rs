@@ -6,9 +6,10 @@ use std::path::Path;
 
 use bytes::{Buf, Bytes};
 use clearway_daemon::config::Config;
-use clearway_daemon::encode::{event_from_bytes, event_to_proto};
 use clearway_daemon::ingest::observation::{Limits, decode};
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::record::run_config;
+use clearway_journal::encode::{event_from_bytes, event_to_proto};
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
@@ -43,7 +44,7 @@ pub fn recording(bytes: &[u8]) {
     let Ok(mut recording) = RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else {
         return;
     };
-    drop(recording.config());
+    drop(run_config(&recording));
     let mut pipeline = pipeline();
     for message in &mut recording {
         if let Ok(RecordedMessage::Event { event, .. }) = message {

@@ -9,8 +9,8 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use clearway_daemon::config::Config;
-use clearway_daemon::encode::event_to_proto;
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_journal::encode::event_to_proto;
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_mapping::event::{self as core, Event};
 use clearway_proto::packed::pack;

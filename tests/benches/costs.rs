@@ -17,7 +17,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use clap::{Parser, ValueEnum};
-use clearway_daemon::encode::EncodedMap;
+use clearway_journal::encode::EncodedMap;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event};

@@ -22,7 +22,8 @@ use std::time::Duration;
 use clap::Parser;
 use clearway_client::test::Replay;
 use clearway_client::{MapStream, Subscription, ZenohClient, now_ns};
-use clearway_daemon::record::reader::RecordingReader;
+use clearway_daemon::record::run_config;
+use clearway_journal::reader::RecordingReader;
 use tokio::runtime::Runtime;
 use webdriver::Browser;
 
@@ -115,7 +116,7 @@ fn simulated(seconds: u32, folder: &Path) -> PathBuf {
 
 /// Writes the recording's configuration with ROS 2 topics to a file; returns its path, and the vehicle's name.
 fn with_ros_2(drive: &Path, folder: &Path) -> (String, String) {
-    let (recorded, _) = RecordingReader::open(drive).and_then(|recording| recording.config()).expect("a recording");
+    let (recorded, _) = RecordingReader::open(drive).and_then(|recording| run_config(&recording)).expect("a recording");
     let mut config = clearway_daemon::config::Config { vehicles: recorded.vehicles, ..Default::default() };
     (config.zenoh.enabled, config.zenoh.ros2.enabled) = (true, true);
     for vehicle in &mut config.vehicles {

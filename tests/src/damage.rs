@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
 
-use clearway_daemon::record::mcap_reader::{McapReadError, McapReader, Message};
-use clearway_daemon::record::repair::{RepairError, repair};
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::verify;
+use clearway_journal::mcap_reader::{McapReadError, McapReader, Message};
+use clearway_journal::repair::{RepairError, repair};
 use mcap::MAGIC;
 use mcap::records::op;
 

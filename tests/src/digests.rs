@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use bytes::Bytes;
-use clearway_daemon::record::reader::{RecordedMessage, RecordingError, RecordingReader};
+use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 use clearway_proto::v1;
 use prost::Message;
 use ring::digest::{SHA256, digest};

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use clearway::cli::replay::{Options, replay};
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::verify;
 use clearway_lidar::model::Model;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;

@@ -12,12 +12,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use clearway_daemon::config::{Config, RecordedMaps};
+use clearway_daemon::config::Config;
 use clearway_daemon::ingest::queue::Reading;
-use clearway_daemon::record::mcap_reader::{McapReader, Message};
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::verify;
 use clearway_daemon::run::{Running, Server, Setup};
+use clearway_journal::RecordedMaps;
+use clearway_journal::mcap_reader::{McapReader, Message};
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::event::Body;
 use clearway_proto::v1;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;

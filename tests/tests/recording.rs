@@ -12,9 +12,10 @@ use std::path::Path;
 
 use clearway_daemon::config::Config;
 use clearway_daemon::ingest::queue::Reading;
-use clearway_daemon::record::reader::{RecordingError, RecordingReader};
-use clearway_daemon::record::verify::{DifferenceKind, verify};
+use clearway_daemon::record::{run_config, verify};
 use clearway_daemon::run::{Server, Setup};
+use clearway_journal::reader::{RecordingError, RecordingReader};
+use clearway_journal::verify::DifferenceKind;
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
@@ -174,7 +175,7 @@ async fn a_truncated_recording_is_read_to_its_last_whole_chunk() {
         most = most.max(events);
     }
     assert!(most > 0, "whole chunks before the cut are read");
-    assert!(matches!(events_in(3), Err(clearway_daemon::record::verify::VerifyError::Recording(_))));
+    assert!(matches!(events_in(3), Err(clearway_journal::verify::VerifyError::Recording(_))));
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -187,7 +188,7 @@ async fn a_recording_has_the_configuration_and_calibration_of_its_maps() {
     assert_eq!(notes["vehicles"], "car");
     assert_eq!(notes["boot_id"], recording.header().boot_id.to_string());
     assert!(notes["calibration/car/top"].contains("factory"), "{notes:?}");
-    let (config, tables) = recording.config().unwrap();
+    let (config, tables) = run_config(&recording).unwrap();
     assert_eq!(config.vehicles, fixture::config().vehicles);
     assert_eq!(tables, [[None]]);
 }
@@ -199,7 +200,7 @@ fn an_mcap_file_without_a_configuration_is_refused() {
     mcap::Writer::new(BufWriter::new(File::create(&file).unwrap())).unwrap().finish().unwrap();
     let error = verify(&file).unwrap_err();
     assert!(
-        matches!(error, clearway_daemon::record::verify::VerifyError::Recording(RecordingError::NoConfig { .. })),
+        matches!(error, clearway_journal::verify::VerifyError::Recording(RecordingError::NoConfig { .. })),
         "{error}"
     );
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use clearway::cli::replay::{Mount, Options, ReplayError, Summary, describe, replay};
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::verify;
 
 async fn replayed(options: Options) -> Result<Summary, ReplayError> {
     fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await
@@ -288,7 +288,7 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
     let digests = ["a.mcap", "--record", "digests.mcap", "--set", "recorder.maps=digest", "--clouds", "clouds"];
     let (success, error) = replay(&digests);
     assert!(success, "{error}");
-    assert_eq!(verify(&at("digests.mcap")).unwrap().recorded, clearway_daemon::config::RecordedMaps::Digest);
+    assert_eq!(verify(&at("digests.mcap")).unwrap().recorded, clearway_journal::RecordedMaps::Digest);
     let (success, error) = replay(&["a.mcap", "--clouds", "clouds"]);
     assert!(!success && error.contains("none is overwritten; name another folder"), "{error}");
     let (success, error) = replay(&["a.mcap", "--record", "old.mcap", "--force"]);

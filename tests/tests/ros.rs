@@ -8,7 +8,7 @@ use std::path::Path;
 
 use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
 use clearway_daemon::config::{Origin, Ros};
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::{run_config, verify};
 use clearway_lidar::model::Model;
 use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::config::Extrinsics;
@@ -191,15 +191,13 @@ async fn a_bag_of_several_sensors_makes_maps_of_all_that_tf_places() {
     let last = header(maps.last_key_value().unwrap().1).unwrap();
     assert!(last.sensors.len() == 2 && last.sensors.iter().all(|sensor| sensor.returns > 1000), "{:?}", last.sensors);
     // Each sensor has its own mount, and its own end.
-    let entries = clearway_daemon::record::reader::RecordingReader::open(&record).unwrap().map(|entry| entry.unwrap());
+    let entries = clearway_journal::reader::RecordingReader::open(&record).unwrap().map(|entry| entry.unwrap());
     let ends = entries.filter_map(|entry| match entry {
-        clearway_daemon::record::reader::RecordedMessage::Event { event, .. } if event.body == Body::End => {
-            Some(event.source)
-        }
+        clearway_journal::reader::RecordedMessage::Event { event, .. } if event.body == Body::End => Some(event.source),
         _ => None,
     });
     assert_eq!(ends.collect::<Vec<_>>(), [0, 1]);
-    let (config, _) = clearway_daemon::record::reader::RecordingReader::open(&record).unwrap().config().unwrap();
+    let (config, _) = run_config(&clearway_journal::reader::RecordingReader::open(&record).unwrap()).unwrap();
     let places = config.vehicles[0].sensors.iter().map(|sensor| (sensor.name.as_str(), sensor.extrinsics.y_m));
     assert!(places.clone().any(|place| place == ("lidar_left", 1.0)), "{:?}", places.collect::<Vec<_>>());
 }
@@ -286,8 +284,8 @@ async fn tf_gives_poses_and_speed_without_odometry_in_a_bag_of_two_files() {
     assert_eq!((ledger.poses, ledger.poses_refused), (stamps.len() as u64 - 1, 0));
     assert_eq!(summary.snapshot.maps, stamps.len() as u64);
     assert!(summary.notes.join("\n").contains("tf is used for poses of base_link in map"), "{:?}", summary.notes);
-    for entry in clearway_daemon::record::reader::RecordingReader::open(&record).unwrap() {
-        let clearway_daemon::record::reader::RecordedMessage::Event { event, .. } = entry.unwrap() else { continue };
+    for entry in clearway_journal::reader::RecordingReader::open(&record).unwrap() {
+        let clearway_journal::reader::RecordedMessage::Event { event, .. } = entry.unwrap() else { continue };
         let Body::EgoPose(pose) = event.body else { continue };
         assert!((pose.speed_mps - 12.0).abs() < 1e-6, "{pose:?}");
         assert!(stamps.contains(&pose.stamp_ns) && pose.map_from_ego.translation.x >= 100.0, "{pose:?}");

@@ -86,7 +86,7 @@ async fn a_recording_has_the_path_of_the_private_key_but_not_the_key() {
     let running = start(config).await;
     feed(&running, readings(1)).await;
     within("shutdown", running.shutdown()).await.unwrap();
-    let recording = clearway_daemon::record::reader::RecordingReader::open(&record).unwrap();
+    let recording = clearway_journal::reader::RecordingReader::open(&record).unwrap();
     let text = recording.header().config.clone().unwrap();
     assert!(text.contains("server.key") && !text.contains("PRIVATE"), "{text}");
     let key = std::fs::read_to_string(certificates("ours").join("server.key")).unwrap();

@@ -12,9 +12,10 @@ use std::path::Path;
 use clearway::cli::make::demo::rig::Rig;
 use clearway::cli::replay::{Options, replay};
 use clearway_daemon::config::Config;
-use clearway_daemon::encode::EncodedMap;
 use clearway_daemon::ingest::observation;
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_daemon::record::run_config;
+use clearway_journal::encode::EncodedMap;
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::MapsConfig;
 use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::map::Map;
@@ -72,7 +73,7 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
     fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
     let mut recording = RecordingReader::open(&record).unwrap();
-    let (config, tables) = recording.config().unwrap();
+    let (config, tables) = run_config(&recording).unwrap();
     // Time by which the arrivals are ahead of the sensor's clock: the poses have stamps of that clock.
     let (mut events, mut ahead_ns) = (Vec::new(), None);
     for entry in recording.by_ref() {

@@ -91,7 +91,7 @@ async fn grpc_zenoh_and_the_recording_have_the_same_bytes_of_a_live_drive() {
     for (sequence, map) in over_grpc.iter().chain(&over_zenoh) {
         assert_eq!(recorded[&(*sequence, LAYER.to_owned())], map, "sequence {sequence}");
     }
-    let report = clearway_daemon::record::verify::verify(&record).unwrap();
+    let report = clearway_daemon::record::verify(&record).unwrap();
     assert!(report.is_good() && report.maps >= 3, "{report:?}");
 }
 
@@ -369,7 +369,7 @@ async fn two_vehicles_have_their_own_sockets_maps_and_journals() {
     let status = client.get_map(get("")).await.unwrap_err();
     assert!(status.message().contains("car, truck"), "of several vehicles one must be named: {status}");
     within("shutdown", running.shutdown()).await.unwrap();
-    let report = clearway_daemon::record::verify::verify(&record).unwrap();
+    let report = clearway_daemon::record::verify(&record).unwrap();
     assert!(report.is_good() && report.maps > maps, "{report:?}");
 }
 

@@ -38,11 +38,12 @@ const WORDS_ALLOWED: [&str; 3] = ["tests/tests/tidy.rs", "CONTRIBUTING.md", "cli
 const CRATE_NAMES: [&str; 2] = ["hyper_util", "tokio_util"];
 
 /// The folders of all crates' sources.
-const CRATES: [&str; 9] = [
+const CRATES: [&str; 10] = [
     "proto/src",
     "proto/ros/src",
     "server/core/lidar/src",
     "server/core/mapping/src",
+    "server/core/journal/src",
     "server/daemon/src",
     "server/src",
     "client/src",

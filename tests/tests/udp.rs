@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 use clearway::cli::replay::{Options, replay};
 use clearway_daemon::config::{Config, Sender, Udp};
 use clearway_daemon::ingest::queue::event_queue;
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::{run_config, verify};
 use clearway_daemon::run::Running;
 use clearway_daemon::status::{Format, prometheus};
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
 use clearway_lidar::capture::Capture;
 use clearway_mapping::event::{Body, Cause};
 use clearway_mapping::ledger::Ledger;
@@ -55,7 +55,7 @@ fn datagrams() -> (Vec<Vec<u8>>, Vec<u8>) {
 /// The ledger of a recording's events.
 fn replayed(record: &Path, vehicle: &str) -> Ledger {
     let mut recording = RecordingReader::open(record).unwrap();
-    let (config, tables) = recording.config().unwrap();
+    let (config, tables) = run_config(&recording).unwrap();
     let index = config.vehicles.iter().position(|v| v.name == vehicle).unwrap();
     let mut pipeline = Pipeline::new(&config.vehicles[index].core(), tables[index].clone()).unwrap();
     for entry in &mut recording {

@@ -25,7 +25,7 @@ use opentelemetry_sdk::Resource;
 use opentelemetry_sdk::trace::{IdGenerator, RandomIdGenerator, SdkTracer, SdkTracerProvider};
 
 use crate::config;
-use crate::encode::EncodedMap;
+use clearway_journal::encode::EncodedMap;
 
 /// Longest time in which the last spans are sent at shutdown. Ours: less than what the publishers have.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);

@@ -21,9 +21,9 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, printable};
 use clearway_daemon::base::file_advice::open_to_read;
-use clearway_daemon::encode::event_from_bytes;
 use clearway_daemon::ingest::files::{Kind, kind};
-use clearway_daemon::record::mcap_reader::{McapReader, Message};
+use clearway_journal::encode::event_from_bytes;
+use clearway_journal::mcap_reader::{McapReader, Message};
 
 /// Describe a file: a recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd).
 #[derive(Args)]

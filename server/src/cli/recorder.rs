@@ -10,8 +10,8 @@ use tonic::Code;
 use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
-use clearway_daemon::record::damage::utc;
 use clearway_daemon::status::recorder_json;
+use clearway_journal::damage::utc;
 
 /// Control the recorder of a running server: start, stop, split, save the last seconds, list, status.
 #[derive(Args)]

@@ -7,10 +7,10 @@ use toml::value::{Datetime, Offset};
 
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line};
-use clearway_daemon::record::damage::utc;
 use clearway_daemon::store::index::{Entry, Found, Search, search};
 use clearway_daemon::store::location;
 use clearway_daemon::store::upload::reason;
+use clearway_journal::damage::utc;
 
 /// Find recordings in a store by vehicle, time, place and faults.
 #[derive(Args)]

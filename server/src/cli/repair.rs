@@ -7,7 +7,7 @@ use clap::Args;
 
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{counted, print_line};
-use clearway_daemon::record::repair::repair;
+use clearway_journal::repair::repair;
 
 /// Write all that can be read of a damaged MCAP file to a new one, and report what is lost.
 ///
@@ -34,7 +34,7 @@ pub struct Options {
 /// Repairs the file and prints what is lost.
 ///
 /// # Errors
-/// [`RepairError`](clearway_daemon::record::repair::RepairError) if the file cannot be read, has no message that can be read, or
+/// [`RepairError`](clearway_journal::repair::RepairError) if the file cannot be read, has no message that can be read, or
 /// the new file cannot be written.
 pub fn run(options: &Options) -> Result<Exit> {
     let report = repair(&options.input, &options.output)?;

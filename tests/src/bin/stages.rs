@@ -25,7 +25,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use clearway_daemon::encode::EncodedMap;
+use clearway_journal::encode::EncodedMap;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::{Sensor, SensorConfig as LidarConfig};

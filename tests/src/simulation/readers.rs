@@ -8,9 +8,9 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
-use clearway_daemon::encode::EncodedMap;
 use clearway_daemon::publish::Vehicles;
 use clearway_daemon::publish::grpc::reader::watch;
+use clearway_journal::encode::EncodedMap;
 use clearway_proto::v1;
 use futures::Stream;
 use futures::channel::mpsc::{UnboundedSender, unbounded};

@@ -5,10 +5,11 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use clearway_daemon::record::mcap_file::Disk;
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
-use clearway_daemon::record::verify::{Difference, DifferenceKind, Report, verify};
+use clearway_daemon::record::verify;
 use clearway_daemon::record::writer::{Files, RecorderCounts};
+use clearway_journal::mcap_file::Disk;
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
+use clearway_journal::verify::{Difference, DifferenceKind, Report};
 
 use super::checks::{Violation, violation};
 use super::fault_plan::DiskFault;
@@ -198,7 +199,7 @@ impl Recorded {
 }
 
 /// The sequences of the events of a recording.
-fn events_of(file: &Path) -> Result<Vec<u64>, clearway_daemon::record::reader::RecordingError> {
+fn events_of(file: &Path) -> Result<Vec<u64>, clearway_journal::reader::RecordingError> {
     let mut events = Vec::new();
     for message in RecordingReader::open(file)? {
         if let RecordedMessage::Event { event, .. } = message? {

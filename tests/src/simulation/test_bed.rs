@@ -9,15 +9,15 @@ use std::time::{Duration, Instant};
 
 use clearway_daemon::base::clock::Clock;
 use clearway_daemon::config::Config;
-use clearway_daemon::encode::EncodedMap;
 use clearway_daemon::engine::Engine;
 use clearway_daemon::ingest::gateway::Gateway;
 use clearway_daemon::ingest::queue::{EventQueue, QueuedEvent, event_queue_with_clock};
 use clearway_daemon::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOutcome, OutcomeSender};
 use clearway_daemon::publish::{Served, Vehicles};
-use clearway_daemon::record::mcap_file::Header;
 use clearway_daemon::record::writer::RecordingWriter;
 use clearway_daemon::status::{Transport, VehicleStatus};
+use clearway_journal::encode::EncodedMap;
+use clearway_journal::mcap_file::Header;
 use clearway_mapping::pipeline::{Pipeline, layer_names};
 use clearway_proto::v1;
 use clearway_sim::impair::Impairment;

@@ -4,7 +4,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use clearway_daemon::record::mcap_reader::McapReader;
+use clearway_journal::mcap_reader::McapReader;
 use clearway_tests::{damage, run};
 use mcap::records::op;
 

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use clearway_daemon::record::mcap_reader::McapReader;
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
-use clearway_daemon::record::repair::repair;
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::{run_config, verify};
+use clearway_journal::mcap_reader::McapReader;
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
+use clearway_journal::repair::repair;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
@@ -61,7 +61,7 @@ fn the_golden_recordings_are_read_by_every_version() {
 /// Reads all events and maps of a golden recording.
 fn read_whole(file: &Path) {
     let mut recording = RecordingReader::open(file).unwrap();
-    let (config, tables) = recording.config().unwrap();
+    let (config, tables) = run_config(&recording).unwrap();
     let mut pipeline = Pipeline::new(&config.vehicles[0].core(), tables[0].clone()).unwrap();
     let (mut events, mut computed, mut layers) = (0, 0, BTreeMap::<String, u64>::new());
     for message in recording.by_ref() {
@@ -209,7 +209,7 @@ fn a_repaired_recording_is_whole_and_has_all_that_can_be_read() {
     assert!(said.matches("lost: ").count() >= 3 && said.contains("/car/journal"), "{said}");
     assert_eq!(clearway(&["info", "repaired.mcap"]).status.code(), Some(0));
     let mut recording = RecordingReader::open(&repaired).unwrap();
-    recording.config().unwrap();
+    run_config(&recording).unwrap();
     assert!(recording.by_ref().all(|message| message.is_ok()) && recording.incomplete().is_none());
     let all = McapReader::open(&golden()).unwrap().count();
     let kept = McapReader::open(&repaired).unwrap().count();

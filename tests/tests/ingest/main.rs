@@ -16,7 +16,7 @@ use clearway_client::observation::{RoadFrame, RoadPurpose, Sensor, by_reason};
 use clearway_client::{Client, ClientError, Ingester, Observation, Refusal, ZenohClient, now_ns};
 use clearway_daemon::config::Config;
 use clearway_daemon::ingest::queue::Reading;
-use clearway_daemon::record::verify::verify;
+use clearway_daemon::record::verify;
 use clearway_daemon::run::{Running, Server, Setup};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Body;

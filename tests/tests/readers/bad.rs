@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::sync::{Arc, Weak};
 
-use clearway_daemon::encode::EncodedMap;
+use clearway_journal::encode::EncodedMap;
 use clearway_proto::v1;
 use clearway_tests::attack::http2::{WATCH, call, opening, reset};
 use clearway_tests::attack::sockets::{Opening, hold};

@@ -4,14 +4,12 @@
 //! |---|---|
 //! | [`clock`] | the wall clock -> nanoseconds |
 //! | `sync` | a mutex -> its value, also after a panic |
-//! | `counted` | a count and a noun -> text |
 //! | [`directory`] | the name of a vehicle -> what is served for it |
-//! | `file_advice` | a path -> an open file, or an error that says what to do |
 //! | [`held_sockets`] | sockets that systemd holds -> listeners |
 
 pub mod clock;
-pub mod counted;
 pub mod directory;
-pub mod file_advice;
 pub mod held_sockets;
 pub mod sync;
+
+pub use clearway_journal::{counted, file_advice};

@@ -41,7 +41,7 @@ pub(crate) use grpc::secret;
 pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
 pub use overrides::of_environment;
-pub use recorder::{Compression, RecordedMaps, Recorder, SaveRule};
+pub use recorder::{Compression, Recorder, SaveRule};
 pub use ros::Ros;
 pub use store::Store;
 pub use traces::Traces;

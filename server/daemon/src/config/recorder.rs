@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use clearway_journal::RecordedMaps;
+use clearway_journal::mcap_file::McapFileOptions;
 use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
@@ -63,30 +65,6 @@ pub enum SaveRule {
     SensorLost,
 }
 
-/// What a recording holds of the maps. Every one of them has all events, from which a replay makes the maps.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RecordedMaps {
-    /// The maps.
-    #[default]
-    Full,
-    /// The header and the SHA-256 of each layer: enough to verify that a replay makes the same bytes.
-    Digest,
-    /// Nothing.
-    None,
-}
-
-impl RecordedMaps {
-    /// The name in the configuration and in the metadata of a recording.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Full => "full",
-            Self::Digest => "digest",
-            Self::None => "none",
-        }
-    }
-}
-
 /// Compression of the chunks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -123,6 +101,15 @@ impl Default for Recorder {
 }
 
 impl Recorder {
+    /// How the files are written.
+    pub fn file_options(&self) -> McapFileOptions {
+        McapFileOptions {
+            chunk_kb: self.chunk_kb,
+            is_compressed: self.compression == Compression::Zstd,
+            maps: self.maps,
+        }
+    }
+
     pub(super) fn check(&self) -> Result<(), ValueError> {
         if !(16..=1 << 20).contains(&self.queue) {
             return Err(ValueError::new("recorder.queue", self.queue, "16 to 1048576 events"));

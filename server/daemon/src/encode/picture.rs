@@ -23,7 +23,7 @@ use clearway_proto::v1;
 use super::legend::{self, Legend};
 use super::palette::Rgb;
 use canvas::Canvas;
-use change::Change;
+use clearway_journal::compare::change::Change;
 pub(crate) use colours::Colours;
 use colours::UNKNOWN;
 pub use error::PictureError;
@@ -126,7 +126,8 @@ pub fn caption(header: &v1::Header, layer: &str) -> Vec<String> {
 /// Draws where the classes of a layer differ from those of the same layer of another map, `before`.
 pub fn of_change(before: &Layer, after: &Layer, style: &Style) -> Picture {
     let range_m = style.range_m.unwrap_or(after.grid.range_m_max());
-    draw(range_m, style, &[], &Change::legend(), |x_m, y_m| Change::at(before, after, x_m, y_m).colour())
+    let colour = |x_m, y_m| change::colour(Change::at(before, after, x_m, y_m));
+    draw(range_m, style, &[], &change::legend(), colour)
 }
 
 /// Draws `range_m` around the vehicle: the colour of each point of the ego frame, rings, safe points, the vehicle, and

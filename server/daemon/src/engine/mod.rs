@@ -28,13 +28,13 @@ use nalgebra::Vector3;
 use tokio::sync::watch;
 
 use crate::base::clock::{WorkTime, now_ns};
-use crate::encode::{self, EncodedMap, Replayed};
 use crate::engine::newest::Newest;
 use crate::engine::turns::{Turn, Turns};
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::receipt::Outcome;
 use crate::record::writer::RecordingHandle;
 use crate::status::{MadeMap, VehicleStatus};
+use clearway_journal::encode::{self, EncodedMap, Replayed};
 
 /// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200
 /// ms.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use clearway_mapping::sensor::sweep::Sweep;
 
-use crate::encode::EncodedMap;
+use clearway_journal::encode::EncodedMap;
 
 /// The newest map of one vehicle; `None` before the first.
 pub type Newest = Option<Arc<EncodedMap>>;

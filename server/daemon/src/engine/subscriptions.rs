@@ -11,8 +11,8 @@ use std::time::Duration;
 
 use tokio::sync::watch;
 
-use crate::encode::EncodedMap;
 use crate::engine::newest::Newest;
+use clearway_journal::encode::EncodedMap;
 
 /// Longest wait for a map with a layer that was not computed so far. Ours: some revolutions of the slowest sensor.
 pub const LAYER_TIMEOUT: Duration = Duration::from_secs(1);

@@ -11,8 +11,8 @@ use clearway_mapping::event::Body;
 use clearway_proto::packed::unpack;
 use clearway_proto::v1;
 
-use crate::encode::event::NoCounterpartError;
-use crate::encode::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
+use clearway_journal::encode::event::NoCounterpartError;
+use clearway_journal::encode::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
 
 /// The limits of one observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

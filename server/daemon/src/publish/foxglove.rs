@@ -33,12 +33,12 @@ use super::listen::access::Caller;
 use super::listen::{Budget, InProgress, Listener, Place, READ_BUFFER_BYTES};
 use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
-use crate::encode::EncodedMap;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
 use crate::engine::newest::NewestSweep;
 use crate::engine::subscriptions::LayerSubscription;
 use crate::status::{Reader, Transport};
+use clearway_journal::encode::EncodedMap;
 
 /// Pages from which Foxglove connects, beside those of the configuration.
 pub const ORIGINS: &[&str] = &["https://app.foxglove.dev"];

@@ -29,9 +29,9 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 use super::served::Served;
 use crate::base::clock::now_ns;
 use crate::config::Ros2;
-use crate::encode::EncodedMap;
 use crate::status::{Reader, Transport};
 use crate::zenoh_session::ZenohError;
+use clearway_journal::encode::EncodedMap;
 
 /// Name of the node.
 const NODE: &str = "clearway";

@@ -40,9 +40,9 @@ use super::ros::Node;
 use super::served::{Served, Vehicles};
 use super::zenoh_pace::{Pace, Probe, Probes, REPEAT};
 use crate::config::{Zenoh as Options, ZenohMode, secret};
-use crate::encode::EncodedMap;
 use crate::status::{Reader, Transport, state_changed};
 use crate::zenoh_session::ZenohError;
+use clearway_journal::encode::EncodedMap;
 
 /// Time between two status messages.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);

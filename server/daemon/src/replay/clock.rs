@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use clearway_proto::v1;
 
-use crate::encode::Replayed;
+use clearway_journal::encode::Replayed;
 
 /// When events of recorded time are due, and how far their stamps are from the present. It starts at the first event
 /// that it is asked about. A pause stops it, also between two events; [`ReplayClock::restart`] begins elsewhere.

@@ -38,13 +38,13 @@ use crate::ingest::udp;
 use crate::publish::listen::security::{Current, Security};
 use crate::publish::listen::{Listener, ListenerHandle};
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
-use crate::record::mcap_file::Header;
 use crate::record::writer::{Recorder, recording_path};
 use crate::status::network::end_text;
 use crate::status::{VehicleStatus, watch_states};
 use crate::traces::Traces;
 #[cfg(feature = "zenoh")]
 use crate::zenoh_session;
+use clearway_journal::mcap_file::Header;
 
 /// Longest time between two signs of life of a listener that does not hang: it gives one twice a second.
 const LISTENER_SILENT_MAX: Duration = Duration::from_secs(3);

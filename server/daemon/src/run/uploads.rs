@@ -241,8 +241,8 @@ mod tests {
 
     use super::*;
     use crate::config::Recorder as Options;
-    use crate::record::mcap_file::Header;
     use crate::record::writer::Recorder;
+    use clearway_journal::mcap_file::Header;
 
     #[tokio::test]
     async fn a_store_that_hangs_is_named_before_a_part_is_sent() {

@@ -15,7 +15,6 @@ use tokio::sync::watch;
 
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
-use crate::encode::EncodedMap;
 use crate::engine::acknowledgements::Acknowledgements;
 use crate::engine::newest::NewestSweep;
 use crate::engine::subscriptions::LayerSubscriptions;
@@ -23,6 +22,7 @@ use crate::ingest::drops::DropCounters;
 use crate::ingest::queue::QueueSpace;
 use crate::record::writer::RecorderCounts;
 use crate::traces::Traces;
+use clearway_journal::encode::EncodedMap;
 
 use super::health::{Health, State};
 use super::histogram::Histogram;

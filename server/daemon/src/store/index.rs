@@ -10,8 +10,8 @@ use prost::Message as _;
 use serde::{Deserialize, Serialize};
 
 use crate::base::counted::counted;
-use crate::record::channel::Content;
-use crate::record::mcap_reader::{McapReadError, McapReader};
+use clearway_journal::channel::Content;
+use clearway_journal::mcap_reader::{McapReadError, McapReader};
 
 /// Edge length of the cells that an entry has for the places of its vehicle, in metres; ours.
 pub const CELL_M: f64 = 25.0;

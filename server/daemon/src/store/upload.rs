@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 
 use super::index::Entry;
 use super::rate::UploadRate;
-use crate::record::mcap_reader::McapReadError;
 use crate::record::writer::{confirmation_of, is_being_written};
+use clearway_journal::mcap_reader::McapReadError;
 
 /// Bytes of one piece of a part, which is sent at once. S3 allows 5 MiB or more.
 const PIECE_BYTES: usize = 8 << 20;

@@ -11,11 +11,11 @@ use crate::cli::shared::configuration::extrinsics;
 use crate::cli::shared::model::ModelParser;
 use clearway_daemon::config::ConfigError;
 use clearway_daemon::ingest::files::FilesError;
-use clearway_daemon::record::reader::RecordingError;
 use clearway_daemon::replay::control::{ControlError, RATES};
 use clearway_daemon::replay::faults::{Fault, FaultError};
 use clearway_daemon::replay::outcome::PlayError;
 use clearway_daemon::run::{ShutdownError, StartError};
+use clearway_journal::reader::RecordingError;
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI, nuScenes and PCD files or folders.
 ///

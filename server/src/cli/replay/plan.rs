@@ -25,10 +25,11 @@ use clearway_daemon::ingest::files::mcap::{McapError, McapOptions};
 use clearway_daemon::ingest::files::{FilesError, Kind, Readings};
 use clearway_daemon::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
 use clearway_daemon::ingest::ros::decoder::PoseSource;
-use clearway_daemon::record::reader::RecordingReader;
+use clearway_daemon::record::run_config;
 use clearway_daemon::replay::faults::Faults;
 use clearway_daemon::replay::timeline::{Timeline, Track};
 use clearway_daemon::run::Setup;
+use clearway_journal::reader::RecordingReader;
 
 /// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
 /// roof of a car.
@@ -356,7 +357,7 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
     if let Some(file) = recorded {
         let recording = RecordingReader::open(file)?;
         if recording.header().config.is_some() {
-            let (mut config, mut tables) = recording.config()?;
+            let (mut config, mut tables) = run_config(&recording)?;
             pick(file, &mut config, &mut tables)?;
             // The publishers, the files and the recorder of the recorded run are not those of this run.
             let config = overridden(Config { vehicles: config.vehicles, ..Config::default() }, options, file)?;

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use super::options::{Options, ReplayError};
 use clearway_daemon::config::{Calibrations, Config, Vehicle};
 use clearway_daemon::ingest::files::{Kind, Readings};
-use clearway_daemon::record::reader::RecordingReader;
+use clearway_daemon::record::run_config;
+use clearway_journal::reader::RecordingReader;
 
 /// A recording of this server.
 pub(super) struct Recorded {
@@ -31,7 +32,7 @@ pub(super) fn several_vehicles(files: &Readings) -> Result<Option<Vec<Recorded>>
         if recording.header().config.is_none() {
             return Ok(None);
         }
-        let (config, tables) = recording.config()?;
+        let (config, tables) = run_config(&recording)?;
         names.extend(config.vehicles.iter().map(|vehicle| vehicle.name.clone()));
         recordings.push(Recorded { file: file.to_owned(), config, tables, boot_id: recording.header().boot_id });
     }
@@ -60,7 +61,7 @@ pub(super) fn check_sensors(file: &Path, config: &Config, recording: &Path) -> R
     if recording.header().config.is_none() {
         return Ok(());
     }
-    let (recorded, _) = recording.config()?;
+    let (recorded, _) = run_config(&recording)?;
     let vehicle = &config.vehicles[0];
     let names =
         |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");

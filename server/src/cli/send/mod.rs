@@ -22,7 +22,7 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, progress_bar};
 use clearway_daemon::ingest::files::{Kind as FileKind, kind};
-use clearway_daemon::record::mcap_reader::McapReader;
+use clearway_journal::mcap_reader::McapReader;
 use udp::{Kind, Sender, Speed};
 
 #[cfg(feature = "sim")]

@@ -5,15 +5,16 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::with_causes;
 use clearway_daemon::base::sync::locked;
 use clearway_daemon::config::{Calibrations, Config};
-use clearway_daemon::record::compare::{After, Comparison, compare};
-use clearway_daemon::record::reader::RecordingReader;
-use clearway_daemon::record::verify::{Report, verify};
+use clearway_daemon::record::{recorded_vehicles, run_config, verify};
+use clearway_journal::compare::{After, Comparison, compare};
+use clearway_journal::reader::RecordingReader;
+use clearway_journal::verify::Report;
 
 /// What is checked of each recording.
 pub enum Check {
@@ -161,11 +162,17 @@ fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
             Outcome::Compared(comparison)
         }
         Check::Config { config, set, worst } => {
-            let compared = match config.as_deref() {
-                Some(NewConfig(config, tables)) => compare(file, &After::Config(config, Some(tables)), *worst)?,
-                None => compare(file, &After::Config(&overridden(file, set)?, None), *worst)?,
+            let given = match config.as_deref() {
+                Some(NewConfig(config, tables)) => recorded_vehicles(config, tables.clone()),
+                None => {
+                    let config = overridden(file, set)?;
+                    let no_tables = vec![Vec::new(); config.vehicles.len()];
+                    recorded_vehicles(&config, no_tables)
+                }
             };
-            Outcome::Compared(compared)
+            let (config, tables) = run_config(&RecordingReader::open(file)?)?;
+            let recorded = &recorded_vehicles(&config, tables);
+            Outcome::Compared(compare(file, &After::Config { given: &given, recorded }, *worst)?)
         }
     })
 }
@@ -173,7 +180,6 @@ fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
 /// The recorded configuration with overrides.
 fn overridden(file: &Path, set: &[String]) -> Result<Config> {
     let recording = RecordingReader::open(file)?;
-    recording.config()?;
-    let text = recording.header().config.as_deref().context("the recording has a configuration")?;
-    Ok(Config::parse(text, &file.join("config.toml"), set)?)
+    run_config(&recording)?;
+    Ok(Config::parse(recording.config_text()?, &file.join("config.toml"), set)?)
 }

@@ -7,7 +7,7 @@ use anyhow::Result;
 use super::checked::{Checked, Outcome};
 use crate::cli::shared::files;
 use clearway_daemon::encode::picture::{self, Picture, Style};
-use clearway_daemon::record::compare::MapChange;
+use clearway_journal::compare::MapChange;
 
 /// Edge of each of the three maps, in pixels; ours, because three of them fit a screen.
 const PIXELS: u32 = 480;

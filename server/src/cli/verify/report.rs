@@ -11,8 +11,8 @@ use serde_json::{Value, json};
 use super::checked::{Checked, Outcome};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::counted;
-use clearway_daemon::config::RecordedMaps;
-use clearway_daemon::record::compare::{Comparison, LayerChange, MapChange};
+use clearway_journal::RecordedMaps;
+use clearway_journal::compare::{Comparison, LayerChange, MapChange};
 
 /// The beginning of every report.
 const XML: &str = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites name=\"clearway verify\"";
@@ -221,7 +221,7 @@ fn escaped(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clearway_daemon::record::verify::{Difference, DifferenceKind, Report};
+    use clearway_journal::verify::{Difference, DifferenceKind, Report};
 
     #[test]
     fn junit_is_xml_with_a_case_for_each_file_whatever_its_name() {

@@ -8,7 +8,7 @@ use std::path::Path;
 use anyhow::{Result, bail};
 use clearway_mapping::event::{Body, Event};
 
-use clearway_daemon::record::reader::{RecordedMessage, RecordingReader};
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
 
 /// Number of pairs of readings after which the answer is known. Ours: about a second of a sensor.
 const PAIRS_MAX: u64 = 2000;

@@ -6,7 +6,7 @@ use super::checked::{Check, Checked, Outcome};
 use super::report::reason;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::counted;
-use clearway_daemon::record::compare::{Comparison, LayerChange};
+use clearway_journal::compare::{Comparison, LayerChange};
 
 /// Greatest number of pairs of classes that are listed for a layer, the most frequent first.
 const CLASSES_MAX: usize = 6;

@@ -1,82 +1,32 @@
-//! Two maps of one layer -> what changed in the class of each cell.
+//! The change of a cell's class -> its colour in a picture, and the legend.
 
-use clearway_proto::map::Layer;
-use clearway_proto::v1::ClassMeaning;
+use clearway_journal::compare::change::Change;
 
 use crate::encode::legend::Legend;
 use crate::encode::palette::Rgb;
 
-/// What changed in the class of a cell.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Change {
-    /// The cell lies outside one of the grids, or is unknown in both maps.
-    Unknown,
-    /// The class is the same, and free.
-    Free,
-    /// The class is the same, and neither free nor unknown.
-    Closed,
-    /// The cell is free now.
-    FreeGained,
-    /// The cell was free.
-    FreeLost,
-    /// Another class, and free in neither or in both maps.
-    Other,
-}
+/// The changes that a picture shows, as its legend names them.
+const SHOWN: [(Change, &str); 5] = [
+    (Change::Free, "still free"),
+    (Change::Closed, "still not free"),
+    (Change::FreeGained, "free gained"),
+    (Change::FreeLost, "free lost"),
+    (Change::Other, "other change"),
+];
 
-impl Change {
-    /// The changes that a picture shows, as its legend names them.
-    const SHOWN: [(Self, &str); 5] = [
-        (Self::Free, "still free"),
-        (Self::Closed, "still not free"),
-        (Self::FreeGained, "free gained"),
-        (Self::FreeLost, "free lost"),
-        (Self::Other, "other change"),
-    ];
-
-    /// The change at a point of the ego frame, in metres.
-    pub fn at(before: &Layer, after: &Layer, x_m: f64, y_m: f64) -> Self {
-        let (Some(was), Some(is)) = (before.grid.cell_at(x_m, y_m), after.grid.cell_at(x_m, y_m)) else {
-            return Self::Unknown;
-        };
-        Self::of(before, was, after, is)
-    }
-
-    /// The change from cell `was` of the layer `before` to cell `is` of the layer `after`.
-    pub fn of(before: &Layer, was: usize, after: &Layer, is: usize) -> Self {
-        let meanings = (before.meaning_of(was), after.meaning_of(is));
-        match meanings {
-            _ if class_name(before, was) == class_name(after, is) => match meanings.1 {
-                ClassMeaning::Unknown => Self::Unknown,
-                ClassMeaning::Free => Self::Free,
-                _ => Self::Closed,
-            },
-            (was, is) if (was == ClassMeaning::Free) == (is == ClassMeaning::Free) => Self::Other,
-            (_, ClassMeaning::Free) => Self::FreeGained,
-            _ => Self::FreeLost,
-        }
-    }
-
-    /// The colour in a picture.
-    pub fn colour(self) -> Rgb {
-        match self {
-            Self::Unknown => [24, 26, 30],
-            Self::Free => [66, 72, 80],
-            Self::Closed => [150, 156, 164],
-            Self::FreeGained => [86, 180, 233],
-            Self::FreeLost => [213, 94, 0],
-            Self::Other => [240, 228, 66],
-        }
-    }
-
-    /// The legend of a picture of changes.
-    pub fn legend() -> Legend {
-        Legend::Classes(Self::SHOWN.map(|(change, name)| (name.to_owned(), change.colour())).to_vec())
+/// The colour of a change.
+pub fn colour(change: Change) -> Rgb {
+    match change {
+        Change::Unknown => [24, 26, 30],
+        Change::Free => [66, 72, 80],
+        Change::Closed => [150, 156, 164],
+        Change::FreeGained => [86, 180, 233],
+        Change::FreeLost => [213, 94, 0],
+        Change::Other => [240, 228, 66],
     }
 }
 
-/// Name of a cell's class: `unknown` without one.
-pub fn class_name(layer: &Layer, cell: usize) -> &str {
-    let value = layer.channel("class").and_then(|channel| channel.cells.get(cell));
-    let class = value.and_then(|value| usize::try_from(value).ok()).and_then(|value| layer.legend.get(value));
-    class.map_or("unknown", |class| &class.name)
+/// The legend of a picture of changes.
+pub fn legend() -> Legend {
+    Legend::Classes(SHOWN.map(|(change, name)| (name.to_owned(), colour(change))).to_vec())
 }

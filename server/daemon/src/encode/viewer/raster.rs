@@ -219,7 +219,7 @@ mod tests {
 
     #[test]
     fn every_class_of_every_layer_has_its_occupancy() {
-        use crate::encode::meaning;
+        use clearway_journal::encode::meaning;
         use clearway_mapping::layer::ClassInfo;
         use clearway_mapping::layer::drivability::class::DrivabilityClass;
         use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;

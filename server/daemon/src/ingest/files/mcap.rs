@@ -8,7 +8,7 @@ use crate::base::counted::counted;
 use crate::ingest::queue::Reading;
 use crate::ingest::ros::choice::{AvailableTopics, ChoiceError};
 use crate::ingest::ros::decoder::TopicDecoder;
-use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
+use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Number of refused messages that are not reported to the event queue yet, by sensor and reason.
 pub type RefusedMessages = BTreeMap<(u16, &'static str), u64>;

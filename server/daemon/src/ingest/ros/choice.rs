@@ -10,7 +10,7 @@ use clearway_ros::{Frames, Kind, PointCloud2};
 use nalgebra::Isometry3;
 
 use super::decoder::{PoseSource, TopicDecoder};
-use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
+use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Duration of the start of a file from which its topics are known, in ns. Ours: latched transforms come first, all
 /// other messages come often.

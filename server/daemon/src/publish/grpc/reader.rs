@@ -13,13 +13,13 @@ use tonic::Status;
 
 use super::selection::{Selection, Sent};
 use crate::base::clock::now_ns;
-use crate::encode::EncodedMap;
 use crate::engine::acknowledgements::{AcknowledgingReader, MapId};
 use crate::engine::newest::Newest;
 use crate::engine::subscriptions::LayerSubscription;
 use crate::publish::served::{Served, Vehicles};
 use crate::status::{Reader, Transport};
 use crate::traces::Traces;
+use clearway_journal::encode::EncodedMap;
 
 /// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the
 /// stream. `name` names the reader to people.

@@ -11,8 +11,8 @@ use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1;
 use tonic::Status;
 
-use crate::encode::EncodedMap;
 use crate::publish::served::Served;
+use clearway_journal::encode::EncodedMap;
 
 /// Greatest `max_in_flight`. Ours: more maps on the way would only be older ones.
 const IN_FLIGHT_MAX: u32 = 64;

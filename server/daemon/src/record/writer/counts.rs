@@ -8,10 +8,10 @@ use std::time::{Duration, Instant, SystemTime};
 
 use clearway_proto::v1;
 
-use super::super::mcap_file::topic_of_layer;
 use crate::base::counted::counted;
 use crate::base::sync::locked;
-use crate::config::RecordedMaps;
+use clearway_journal::RecordedMaps;
+use clearway_journal::mcap_file::topic_of_layer;
 
 /// A recording ended before the last event or map.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

@@ -16,8 +16,8 @@ use std::time::{Duration, SystemTime};
 use clearway_proto::v1;
 use mcap::McapError;
 
-use super::super::mcap_file::Disk;
 use crate::config::Recorder as Options;
+use clearway_journal::mcap_file::Disk;
 
 /// Age of an unfinished file after which it counts as left, on a file system without locks.
 const STILL_WRITTEN: Duration = Duration::from_secs(60);

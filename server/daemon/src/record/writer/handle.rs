@@ -15,11 +15,12 @@ use clearway_mapping::config::VehicleConfig;
 use clearway_mapping::event::{Body, Event};
 use clearway_mapping::pipeline::{Handover, Pipeline};
 
-use super::super::mcap_file::Header;
 use super::counts::RecorderCounts;
-use crate::config::{RecordedMaps, Recorder as Options};
-use crate::encode::EncodedMap;
+use crate::config::Recorder as Options;
 use crate::traces::Hop;
+use clearway_journal::RecordedMaps;
+use clearway_journal::encode::EncodedMap;
+use clearway_journal::mcap_file::Header;
 
 /// Greatest difference of the stamps of the newest maps of both pipelines at a handover, ns. Ours: far below the period
 /// of a sensor, so that the stamps of the maps rise across the handover.

@@ -21,9 +21,9 @@ use std::sync::mpsc::{RecvTimeoutError, SendError, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use super::mcap_file::Header;
 use crate::base::file_advice::advised;
 use crate::config::Recorder as Options;
+use clearway_journal::mcap_file::Header;
 
 mod control;
 mod counts;

@@ -6,8 +6,8 @@ use clearway_mapping::event::Event;
 use clearway_proto::v1;
 use mcap::McapError;
 
-use super::super::mcap_file::{Disk, McapFile};
 use super::counts::RecorderCounts;
+use clearway_journal::mcap_file::{Disk, McapFile};
 
 /// One open part.
 pub(super) struct Part<D: Disk> {

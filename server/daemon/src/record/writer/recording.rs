@@ -14,14 +14,14 @@ use clearway_mapping::event::Event;
 use clearway_proto::v1;
 use mcap::McapError;
 
-use super::super::mcap_file::{Header, McapFile};
 use super::control::{Command, Request};
 use super::counts::RecorderCounts;
 use super::folder::{Files, RecordError, with_cause};
 use super::handle::{Item, Link, RecordingHandle, WantedPart, link};
 use super::part::Part;
 use crate::config::Recorder as Options;
-use crate::encode::EncodedMap;
+use clearway_journal::encode::EncodedMap;
+use clearway_journal::mcap_file::{Header, McapFile};
 
 /// Time between two attempts to begin a part on a disk that has failed. Ours: a disk that is full or was pulled out
 /// needs a person.
@@ -393,7 +393,7 @@ impl<F: Files> RecordingWriter<F> {
         let path = self.files.path(number);
         let create = |source| RecordError::Create { file: path.clone(), source };
         let disk = self.files.create(number).map_err(create)?;
-        let written = McapFile::create(disk, &self.options, &self.header, number);
+        let written = McapFile::create(disk, self.options.file_options(), &self.header, number);
         // A file without a whole header is of no use; once it is deleted, its number is free again.
         let is_free = written.is_err() && self.files.discard(number).is_ok();
         self.newest_part = if is_free { self.newest_part } else { number };

@@ -24,7 +24,7 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, progress_bar, usage_error};
 use clearway_daemon::encode::picture::{self, Style};
-use clearway_daemon::record::mcap_reader::{McapReader, Message};
+use clearway_journal::mcap_reader::{McapReader, Message};
 pub use drawing::DrawingOptions;
 
 mod drawing;

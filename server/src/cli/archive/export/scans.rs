@@ -16,7 +16,7 @@ use nalgebra::Isometry3;
 use prost::Message;
 use serde::Deserialize;
 
-use clearway_daemon::record::mcap_reader::Header;
+use clearway_journal::mcap_reader::Header;
 
 /// One scan of one sensor.
 pub struct SensorScan<'a> {

@@ -26,7 +26,7 @@ use mcap::records::MessageHeader;
 
 use super::scans::{ScanDecoder, SensorScan};
 use crate::cli::shared::files;
-use clearway_daemon::record::mcap_reader::{Header, Message};
+use clearway_journal::mcap_reader::{Header, Message};
 
 /// Kind of the messages in the file.
 #[derive(Clone, Copy, PartialEq, Eq)]

@@ -12,9 +12,9 @@ use tokio::time::MissedTickBehavior;
 
 use clearway_daemon::base::clock::now_ns;
 use clearway_daemon::config::{Config, Sender, Udp};
-use clearway_daemon::encode::EncodedMap;
 use clearway_daemon::encode::picture::{self, Style};
 use clearway_daemon::run::{Running, Server, Setup};
+use clearway_journal::encode::EncodedMap;
 
 use super::car::{self, Car};
 use super::error::{DemoError, PictureError};

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 use super::damage::Damage;
 use super::mcap_reader::{McapReadError, McapReader, REPAIR_LOST_KEY, REPAIR_METADATA};
-use crate::base::file_advice::advised;
+use crate::file_advice::advised;
 
 /// What was recovered and what is lost.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -14,19 +14,24 @@ use clearway_proto::codec::Limits;
 use clearway_proto::grid::Grid;
 use clearway_proto::map::{Layer, MapError, decode_map};
 
+use change::{Change, class_name};
 use computing::Computing;
 
 use super::reader::{RecordedMessage, RecordingError, RecordingReader};
-use crate::config::{Calibrations, Config, RecordedMaps};
-use crate::encode::picture::change::{Change, class_name};
+use crate::{RecordedMaps, RecordedVehicle};
 
+pub mod change;
 mod computing;
 
 /// Where the maps after the change come from.
 pub enum After<'a> {
-    /// They are computed from the recorded events with this configuration and its calibration tables; without tables,
-    /// with the recorded ones.
-    Config(&'a Config, Option<&'a Calibrations>),
+    /// They are computed from the recorded events with another configuration.
+    Config {
+        /// The configuration of each recorded vehicle, in any order; without tables, a vehicle uses the recorded ones.
+        given: &'a [RecordedVehicle],
+        /// The recorded configuration.
+        recorded: &'a [RecordedVehicle],
+    },
     /// They are those of this recording.
     Recording(&'a Path),
 }
@@ -200,14 +205,13 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
         Pairs { waiting: BTreeMap::new(), worst, changed_most: BTreeMap::new(), comparison: Comparison::default() };
     let mut recording = RecordingReader::open(before)?;
     match after {
-        After::Config(config, tables) => {
-            let mut vehicles = pipelines(before, &recording, config, *tables)?;
+        After::Config { given, recorded } => {
+            let boot_id = recording.header().boot_id;
+            let mut vehicles = pipelines(before, boot_id, given, recorded)?;
             // Without recorded maps those of the recorded configuration are made too.
             let mut recorded = match recording.maps() {
                 RecordedMaps::Full => Vec::new(),
-                RecordedMaps::Digest | RecordedMaps::None => {
-                    pipelines(before, &recording, &recording.config()?.0, None)?
-                }
+                RecordedMaps::Digest | RecordedMaps::None => pipelines(before, boot_id, recorded, recorded)?,
             };
             let losses = recording.loss_count();
             while let Some(message) = recording.next() {
@@ -279,35 +283,31 @@ const AFTER: usize = 1;
 /// The pipelines of a configuration, for the vehicles of a recording.
 fn pipelines(
     file: &Path,
-    recording: &RecordingReader,
-    config: &Config,
-    tables: Option<&Calibrations>,
+    boot_id: u64,
+    given: &[RecordedVehicle],
+    recorded: &[RecordedVehicle],
 ) -> Result<Vec<Computing>, CompareError> {
-    let (recorded, recorded_tables) = recording.config()?;
-    let names = |config: &Config| config.vehicles.iter().map(|vehicle| vehicle.name.clone()).collect::<Vec<_>>();
+    let names = |vehicles: &[RecordedVehicle]| vehicles.iter().map(|vehicle| vehicle.config.name.clone()).collect();
     let misfit = |what: String, given: Vec<String>, recorded: Vec<String>| {
         let [given, recorded] = [given, recorded].map(|names| names.join(", "));
         CompareError::Misfit { file: file.to_owned(), what, given, recorded }
     };
-    let tables = tables.unwrap_or(&recorded_tables);
     let mut vehicles = Vec::new();
-    for was in &recorded.vehicles {
-        let at = config.vehicles.iter().position(|vehicle| vehicle.name == was.name);
-        let at = at.ok_or_else(|| misfit("its vehicles are".into(), names(config), names(&recorded)))?;
-        let is = &config.vehicles[at];
-        let [given, known] =
-            [is, was].map(|vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.clone()).collect::<Vec<_>>());
+    for was in recorded {
+        let is = given.iter().find(|vehicle| vehicle.config.name == was.config.name);
+        let is = is.ok_or_else(|| misfit("its vehicles are".into(), names(given), names(recorded)))?;
+        let [given, known] = [is, was]
+            .map(|vehicle| vehicle.config.sensors.iter().map(|sensor| sensor.name.clone()).collect::<Vec<_>>());
         if given != known {
-            return Err(misfit(format!("the sensors of vehicle {} are", is.name), given, known));
+            return Err(misfit(format!("the sensors of vehicle {} are", is.config.name), given, known));
         }
-        let tables = tables.get(at).filter(|tables| tables.len() == is.sensors.len());
-        let tables = tables.cloned().unwrap_or_else(|| vec![None; is.sensors.len()]);
+        let tables = if is.tables.is_empty() { &was.tables } else { &is.tables };
         vehicles.push(Computing {
-            name: is.name.as_str().into(),
-            boot_id: recording.header().boot_id,
-            valid_ms: is.maps.valid_ms,
+            name: is.config.name.as_str().into(),
+            boot_id,
+            valid_ms: is.config.maps.valid_ms,
             next_event: 0,
-            pipeline: Pipeline::new(&is.core(), tables)?,
+            pipeline: Pipeline::new(&is.config, tables.clone())?,
         });
     }
     Ok(vehicles)

@@ -4,7 +4,7 @@
 //! one `clearway.v1.Map`. Each layer is cropped and compared at most once, for all readers that need the same.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use bytes::Bytes;
 use clearway_proto::codec::Limits;
@@ -13,8 +13,6 @@ use clearway_proto::map::encode_layer;
 use clearway_proto::region::{RegionError, crop};
 use clearway_proto::v1;
 use prost::Message;
-
-use crate::base::sync::locked;
 
 /// Most payloads kept for one map; further ones are encoded for each reader. Ours: ten readers with regions of their
 /// own, six layers each.
@@ -33,7 +31,7 @@ type Payload = OnceLock<Result<Bytes, RegionError>>;
 impl PayloadCache {
     /// The payload of a key, encoded or not.
     pub fn slot(&self, key: Key) -> Arc<Payload> {
-        let mut payloads = locked(&self.0);
+        let mut payloads = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         match payloads.get(&key) {
             Some(slot) => slot.clone(),
             None if payloads.len() >= PAYLOADS_MAX => Arc::default(),

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use clearway_proto::v1;
 use mcap::records::{Record, Statistics};
 
-use crate::base::counted::counted;
+use crate::counted::counted;
 
 /// The numbers of records that were read, and those that the file states.
 #[derive(Default)]

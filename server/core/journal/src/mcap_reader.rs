@@ -16,8 +16,8 @@ use clearway_ros::Kind;
 use mcap::records::Record;
 use prost::Message as _;
 
-use crate::base::counted::counted;
-use crate::base::file_advice::advised;
+use crate::counted::counted;
+use crate::file_advice::advised;
 
 use super::channel::{Channel, Content};
 use super::damage::Damage;

@@ -9,7 +9,7 @@ use mcap::records::Record;
 use super::bag_records::BagRecords;
 use super::damage::LostPart;
 use super::mcap_records::{McapRecords, RecordsError};
-use crate::base::file_advice::open_to_read;
+use crate::file_advice::open_to_read;
 
 /// First bytes of a bag in sqlite.
 const SQLITE: &[u8] = b"SQLite format 3\0";

@@ -23,7 +23,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use clearway_mapping::event::Event;
@@ -34,8 +34,7 @@ use mcap::{Attachment, McapError, WriteOptions};
 use prost::Message;
 
 use super::header::FORMAT;
-use crate::base::sync::locked;
-use crate::config::{Compression, RecordedMaps, Recorder as Options};
+use crate::RecordedMaps;
 use crate::encode::{self, EncodedMap};
 
 /// The contents of a recording before its first event.
@@ -51,6 +50,17 @@ pub struct Header {
     pub calibrations: Vec<(String, String, String)>,
     /// Further metadata, by name.
     pub metadata: BTreeMap<String, String>,
+}
+
+/// How an MCAP file is written.
+#[derive(Clone, Copy, Debug)]
+pub struct McapFileOptions {
+    /// Length of a chunk before its compression, in KiB.
+    pub chunk_kb: u64,
+    /// True if chunks are compressed with zstd.
+    pub is_compressed: bool,
+    /// What is written of the maps.
+    pub maps: RecordedMaps,
 }
 
 /// The disk that receives the bytes of one file: a file, or a simulated disk in tests.
@@ -92,6 +102,12 @@ impl<D: Disk> StopAtFailure<D> {
 /// The disk, for the MCAP library to write and for [`McapFile`] to sync.
 struct SharedDisk<D: Disk>(Arc<Mutex<StopAtFailure<D>>>);
 
+impl<D: Disk> SharedDisk<D> {
+    fn locked(&self) -> MutexGuard<'_, StopAtFailure<D>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
 impl<D: Disk> Clone for SharedDisk<D> {
     fn clone(&self) -> Self {
         Self(self.0.clone())
@@ -100,19 +116,19 @@ impl<D: Disk> Clone for SharedDisk<D> {
 
 impl<D: Disk> Write for SharedDisk<D> {
     fn write(&mut self, data: &[u8]) -> io::Result<usize> {
-        let mut disk = locked(&self.0);
+        let mut disk = self.locked();
         let written = disk.unless_failed(|disk| disk.write(data))?;
         disk.bytes += written as u64;
         Ok(written)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        locked(&self.0).unless_failed(Write::flush)
+        self.locked().unless_failed(Write::flush)
     }
 }
 
 /// The topic of a layer's maps, or of their digests.
-pub(super) fn topic_of_layer(vehicle: &str, layer: &str, maps: RecordedMaps) -> String {
+pub fn topic_of_layer(vehicle: &str, layer: &str, maps: RecordedMaps) -> String {
     let kind = if maps == RecordedMaps::Digest { "digest" } else { "map" };
     format!("/{vehicle}/{kind}/{layer}")
 }
@@ -124,12 +140,12 @@ fn digest(header: &Bytes, map: &Bytes) -> Vec<u8> {
 }
 
 /// The SHA-256 of an encoded map.
-pub(super) fn sha256(map: &Bytes) -> Bytes {
+pub fn sha256(map: &Bytes) -> Bytes {
     Bytes::copy_from_slice(ring::digest::digest(&ring::digest::SHA256, map).as_ref())
 }
 
 /// An open MCAP file with the channels of all vehicles.
-pub(super) struct McapFile<D: Disk> {
+pub struct McapFile<D: Disk> {
     writer: mcap::Writer<NoSeek<BufWriter<SharedDisk<D>>>>,
     disk: SharedDisk<D>,
     vehicles: Vec<VehicleChannels>,
@@ -146,16 +162,12 @@ struct VehicleChannels {
 
 impl<D: Disk> McapFile<D> {
     /// Writes the header of part number `part` to `disk`.
-    pub(super) fn create(disk: D, options: &Options, header: &Header, part: u64) -> Result<Self, McapError> {
+    pub fn create(disk: D, options: McapFileOptions, header: &Header, part: u64) -> Result<Self, McapError> {
         let disk = SharedDisk(Arc::new(Mutex::new(StopAtFailure { disk, failed: None, bytes: 0 })));
-        let compression = match options.compression {
-            Compression::Zstd => Some(mcap::Compression::Zstd),
-            Compression::None => None,
-        };
         let mut writer = WriteOptions::new()
             .profile("")
             .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
-            .compression(compression)
+            .compression(options.is_compressed.then_some(mcap::Compression::Zstd))
             .chunk_size(Some(options.chunk_kb << 10))
             .calculate_chunk_crcs(true)
             .calculate_data_section_crc(true)
@@ -207,19 +219,19 @@ impl<D: Disk> McapFile<D> {
     }
 
     /// Number of bytes in the file so far.
-    pub(super) fn bytes(&self) -> u64 {
-        locked(&self.disk.0).bytes
+    pub fn bytes(&self) -> u64 {
+        self.disk.locked().bytes
     }
 
     /// Writes an event into the journal of the vehicle with this index.
-    pub(super) fn write_event(&mut self, vehicle: usize, event: &Event) -> Result<(), McapError> {
+    pub fn write_event(&mut self, vehicle: usize, event: &Event) -> Result<(), McapError> {
         let bytes = encode::event_to_proto(event).encode_to_vec();
         self.newest_ns = event.arrival_ns;
         self.write_message(self.vehicles[vehicle].journal, event.sequence, event.arrival_ns, &bytes)
     }
 
     /// Writes each layer of a map, or its digest, into its channel of the vehicle with this index.
-    pub(super) fn write_map(&mut self, vehicle: usize, map: &EncodedMap) -> Result<(), McapError> {
+    pub fn write_map(&mut self, vehicle: usize, map: &EncodedMap) -> Result<(), McapError> {
         for (layer, chunk) in &map.layers {
             let Some(&channel) = self.vehicles[vehicle].maps.get(layer) else { continue };
             let bytes: Bytes = map.layer(chunk);
@@ -234,19 +246,14 @@ impl<D: Disk> McapFile<D> {
 
     /// Writes a keyframe of the vehicle with this index, with the log time of the newest event, but no earlier than
     /// `least_ns`: a new file has no event yet.
-    pub(super) fn write_keyframe(
-        &mut self,
-        vehicle: usize,
-        least_ns: i64,
-        keyframe: &v1::Keyframe,
-    ) -> Result<(), McapError> {
+    pub fn write_keyframe(&mut self, vehicle: usize, least_ns: i64, keyframe: &v1::Keyframe) -> Result<(), McapError> {
         let channel = self.vehicles[vehicle].keyframes;
         self.newest_ns = self.newest_ns.max(least_ns);
         self.write_message(channel, keyframe.first_event, self.newest_ns, &keyframe.encode_to_vec())
     }
 
     /// Writes what the file holds and lacks, with the log time of the newest event.
-    pub(super) fn write_counts(&mut self, counts: &v1::RecordingCounts) -> Result<(), McapError> {
+    pub fn write_counts(&mut self, counts: &v1::RecordingCounts) -> Result<(), McapError> {
         self.write_message(self.counts, 0, self.newest_ns, &counts.encode_to_vec())
     }
 
@@ -259,22 +266,22 @@ impl<D: Disk> McapFile<D> {
     }
 
     /// Ends the current chunk and waits until the disk has it, so that a power cut does not lose it.
-    pub(super) fn sync(&mut self) -> Result<(), McapError> {
+    pub fn sync(&mut self) -> Result<(), McapError> {
         self.writer.flush()?;
-        locked(&self.disk.0).unless_failed(Disk::sync).map_err(McapError::Io)
+        self.disk.locked().unless_failed(Disk::sync).map_err(McapError::Io)
     }
 
     /// Writes the closing records and waits until the disk has them.
-    pub(super) fn finish(mut self) -> Result<(), McapError> {
+    pub fn finish(mut self) -> Result<(), McapError> {
         self.writer.finish()?;
         // `finish` leaves the last bytes in the buffer.
         let buffer = self.writer.into_inner().into_inner();
         buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
-        locked(&self.disk.0).unless_failed(Disk::sync).map_err(McapError::Io)
+        self.disk.locked().unless_failed(Disk::sync).map_err(McapError::Io)
     }
 
     /// Leaves the file as it is, without closing records: it stays recognizable as cut.
-    pub(super) fn abandon(self) {
-        locked(&self.disk.0).failed.get_or_insert(io::ErrorKind::Other);
+    pub fn abandon(self) {
+        self.disk.locked().failed.get_or_insert(io::ErrorKind::Other);
     }
 }

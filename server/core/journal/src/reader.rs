@@ -1,12 +1,13 @@
 //! A recording -> its events, its maps and the ROS 2 messages that [`clearway_ros`] decodes, in file order; and the
 //! configuration of the recorded run.
 
+use std::error::Error;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
-use clearway_mapping::config::TimeConfig;
+use clearway_mapping::config::SensorConfig;
 use clearway_mapping::event::Event;
 use clearway_proto::v1;
 use clearway_ros::Kind;
@@ -15,7 +16,7 @@ use prost::Message as _;
 use super::channel::Content;
 use super::damage::Damage;
 use super::mcap_reader::{Header, McapReadError, McapReader, Message};
-use crate::config::{Calibrations, Config, ConfigError, RecordedMaps};
+use crate::RecordedMaps;
 use crate::encode::{EventDecodeError, event_from_bytes};
 
 /// One message of a recording.
@@ -94,7 +95,7 @@ pub enum RecordingError {
     },
     /// The recorded configuration is invalid.
     #[error(transparent)]
-    Config(#[from] ConfigError),
+    Config(Box<dyn Error + Send + Sync>),
     /// A recorded calibration is missing or invalid.
     #[error("{}: attachment {name}: {reason}", file.display())]
     Calibration {
@@ -165,6 +166,11 @@ impl RecordingReader {
         Ok(Self { reader: McapReader::from_source(file, source)?, has_ended: false })
     }
 
+    /// The file's path.
+    pub fn file(&self) -> &Path {
+        self.reader.file()
+    }
+
     /// The contents before the first message.
     pub fn header(&self) -> &Header {
         self.reader.header()
@@ -219,33 +225,28 @@ impl RecordingReader {
         kinds.into_iter().find(|maps| recorded.is_some_and(|name| name == maps.as_str())).unwrap_or_default()
     }
 
-    /// The configuration of the recorded run, and its calibration tables as [`Config::calibrations`] returns them.
+    /// The configuration of the recorded run, TOML.
     ///
     /// # Errors
-    /// [`RecordingError::NoConfig`] if the recording has no configuration, [`RecordingError::Config`] if it is invalid,
-    /// [`RecordingError::Calibration`] if a table that it names is missing or invalid.
-    pub fn config(&self) -> Result<(Config, Calibrations), RecordingError> {
-        let (file, header) = (self.reader.file(), self.header());
-        let no_config = || RecordingError::NoConfig { file: file.to_owned(), reason: self.why_no_config() };
-        let text = header.config.as_ref().ok_or_else(no_config)?;
-        let mut config = Config::parse(text, &file.join("config.toml"), &[])?;
-        use_rules_of_the_run(&mut config, text);
-        let table = |vehicle: &str, sensor: &clearway_mapping::config::SensorConfig| {
-            if sensor.calibration.is_none() {
-                return Ok(None);
-            }
-            let name = format!("calibration/{vehicle}/{}.yaml", sensor.name);
-            let text = header.calibrations.get(&name);
-            let table = text.map(|text| Calibration::load_str(text).map_err(|error| error.to_string()));
-            let table = table.unwrap_or_else(|| Err("missing".into()));
-            table.map(Some).map_err(|reason| RecordingError::Calibration { file: file.to_owned(), name, reason })
-        };
-        let tables = config
-            .vehicles
-            .iter()
-            .map(|v| v.sensors.iter().map(|s| table(&v.name, s)).collect())
-            .collect::<Result<_, _>>()?;
-        Ok((config, tables))
+    /// [`RecordingError::NoConfig`] if the recording has none.
+    pub fn config_text(&self) -> Result<&str, RecordingError> {
+        let no_config = || RecordingError::NoConfig { file: self.file().to_owned(), reason: self.why_no_config() };
+        self.header().config.as_deref().ok_or_else(no_config)
+    }
+
+    /// The calibration table of a sensor of the recorded run; `None` if its configuration names none.
+    ///
+    /// # Errors
+    /// [`RecordingError::Calibration`] if the configuration names a table that is missing or invalid.
+    pub fn table(&self, vehicle: &str, sensor: &SensorConfig) -> Result<Option<Calibration>, RecordingError> {
+        if sensor.calibration.is_none() {
+            return Ok(None);
+        }
+        let name = format!("calibration/{vehicle}/{}.yaml", sensor.name);
+        let text = self.header().calibrations.get(&name);
+        let table = text.map(|text| Calibration::load_str(text).map_err(|error| error.to_string()));
+        let table = table.unwrap_or_else(|| Err("missing".into()));
+        table.map(Some).map_err(|reason| RecordingError::Calibration { file: self.file().to_owned(), name, reason })
     }
 
     fn why_no_config(&self) -> String {
@@ -292,18 +293,6 @@ impl RecordingReader {
     }
 }
 
-/// Sets the rules of a run that was recorded before they could be configured. A recorded configuration is complete, so
-/// a table that it lacks is one that its program did not have.
-fn use_rules_of_the_run(config: &mut Config, text: &str) {
-    let document: toml::Table = text.parse().unwrap_or_default();
-    let recorded = document.get("vehicle").and_then(toml::Value::as_array).into_iter().flatten();
-    for (vehicle, recorded) in config.vehicles.iter_mut().zip(recorded) {
-        if recorded.get("time").is_none() {
-            vehicle.time = TimeConfig::WITHOUT_EPOCHS;
-        }
-    }
-}
-
 impl Iterator for RecordingReader {
     type Item = Result<RecordedMessage, RecordingError>;
 
@@ -324,23 +313,5 @@ impl Iterator for RecordingReader {
         };
         self.has_ended = !matches!(next, Some(Ok(_)));
         next
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_recording_of_a_program_without_epochs_is_replayed_without_epochs() {
-        let mut config = Config::of_one_vehicle("car", "top");
-        let text = config.to_toml();
-        use_rules_of_the_run(&mut config, &text);
-        assert_eq!(config.vehicles[0].time, TimeConfig::default());
-        let mut document: toml::Table = text.parse().unwrap();
-        let vehicle = document["vehicle"][0].as_table_mut().unwrap();
-        assert!(vehicle.remove("time").is_some(), "a recorded configuration is complete");
-        use_rules_of_the_run(&mut config, &document.to_string());
-        assert_eq!(config.vehicles[0].time, TimeConfig::WITHOUT_EPOCHS);
     }
 }

@@ -10,7 +10,7 @@ use rusqlite::{Connection, OpenFlags, params};
 
 use super::chunk::RECORD_BYTES_MAX;
 use super::damage::LostPart;
-use crate::base::counted::counted;
+use crate::counted::counted;
 
 /// Number of messages that are read at once. Ours: a message of points has about a megabyte.
 const BATCH: i64 = 16;

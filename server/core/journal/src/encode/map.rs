@@ -214,7 +214,7 @@ pub(super) fn pose(isometry: &Isometry3<f64>) -> v1::Pose {
 }
 
 /// A sensor's state on the wire.
-pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
+pub fn sensor(state: &SensorState) -> v1::SensorState {
     v1::SensorState {
         name: state.name.to_string(),
         model: state.model.to_owned(),
@@ -297,7 +297,7 @@ fn layer(layer: &Layer) -> v1::Layer {
 }
 
 /// Translates the core's meaning of a class to the wire's.
-pub(crate) fn meaning(meaning: Meaning) -> v1::ClassMeaning {
+pub fn meaning(meaning: Meaning) -> v1::ClassMeaning {
     match meaning {
         Meaning::Unknown => v1::ClassMeaning::Unknown,
         Meaning::Free => v1::ClassMeaning::Free,

@@ -38,7 +38,7 @@ fn road(road: &Road) -> v1::Road {
 ///
 /// # Errors
 /// [`NoCounterpartError`] for an unknown purpose or frame, and if x and y differ in length.
-pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, NoCounterpartError> {
+pub fn road_from_proto(road: v1::Road) -> Result<Road, NoCounterpartError> {
     let purpose = match road.purpose() {
         v1::RoadPurpose::Paint => RoadPurpose::Paint,
         v1::RoadPurpose::Route => RoadPurpose::Route,
@@ -64,7 +64,7 @@ pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, NoCounterpartError
 }
 
 /// An ego pose from the wire; `None` if the pose is missing.
-pub(crate) fn ego_pose_from_proto(ego: &v1::EgoPose) -> Option<EgoPose> {
+pub fn ego_pose_from_proto(ego: &v1::EgoPose) -> Option<EgoPose> {
     let pose = ego.map_from_ego.as_ref()?;
     // Not normalised again: rounding would give another pose than the one that was processed.
     let rotation = Unit::new_unchecked(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
@@ -98,7 +98,7 @@ fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
 ///
 /// # Errors
 /// [`NoCounterpartError`] for an unknown model, and if blind_deg holds no pairs.
-pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, NoCounterpartError> {
+pub fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, NoCounterpartError> {
     let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
     let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err(NoCounterpartError("pairs in blind_deg")) };
@@ -137,7 +137,7 @@ fn scan(scan: &Scan) -> v1::Scan {
 ///
 /// # Errors
 /// [`NoCounterpartError`] if a list ends inside a number, or a direction lacks a coordinate.
-pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, NoCounterpartError> {
+pub fn scan_from_proto(scan: v1::Scan) -> Result<Scan, NoCounterpartError> {
     const PART: NoCounterpartError = NoCounterpartError("whole number at the end of a scan's list");
     let floats = |bytes: &[u8]| unpack(bytes).ok_or(PART);
     let no_returns = floats(&scan.no_returns)?;

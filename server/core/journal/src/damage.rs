@@ -7,7 +7,7 @@ use std::time::{Duration, UNIX_EPOCH};
 use mcap::records::MessageIndex;
 use serde_json::{Value, json};
 
-use crate::base::counted::counted;
+use crate::counted::counted;
 
 /// A part of a file that cannot be read, as its reader finds it: before the names of its channels are known.
 #[derive(Clone, Debug, PartialEq, Eq)]

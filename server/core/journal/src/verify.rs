@@ -7,7 +7,6 @@
 //! missing or not in their place, all recorded maps without a computed one, and the reverse.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -19,11 +18,11 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::config::RecordedMaps;
+use crate::damage::Damage;
 use crate::encode::{EncodedMap, as_served, as_served_with};
-use crate::record::damage::Damage;
-use crate::record::mcap_file::sha256;
-use crate::record::reader::{Beginning, RecordedMessage, RecordingError, RecordingReader};
+use crate::mcap_file::sha256;
+use crate::reader::{Beginning, RecordedMessage, RecordingError, RecordingReader};
+use crate::{RecordedMaps, RecordedVehicle};
 
 mod difference;
 
@@ -136,29 +135,27 @@ struct VehicleReplay {
     extra: BTreeSet<(u64, String)>,
 }
 
-/// Verifies a recording. A map that differs and a damaged part are no errors; the [`Report`] contains them.
+/// Verifies a recording with the recorded configuration of its vehicles. A map that differs and a damaged part are no errors; the [`Report`] contains them.
 ///
 /// # Errors
 /// [`VerifyError::Recording`] if the file is not a recording or cannot be read, [`VerifyError::Config`] if its
 /// configuration is invalid.
-pub fn verify(file: &Path) -> Result<Report, VerifyError> {
-    let mut recording = RecordingReader::open(file)?;
-    let beginning = if recording.maps() == RecordedMaps::None { Beginning::default() } else { Beginning::of(file)? };
+pub fn verify(mut recording: RecordingReader, vehicles: Vec<RecordedVehicle>) -> Result<Report, VerifyError> {
+    let has_maps = recording.maps() != RecordedMaps::None;
+    let beginning = if has_maps { Beginning::of(recording.file())? } else { Beginning::default() };
     let stated_boot_id = recording.header().boot_id;
     let boot_id = beginning.boot_id.unwrap_or(stated_boot_id);
-    let (config, tables) = recording.config()?;
     let mut replays = Vec::new();
     let is_first_part = recording.part().map_or(beginning.first_event == Some(0), |part| part == 1);
-    for (vehicle, tables) in config.vehicles.iter().zip(tables) {
-        let config = vehicle.core();
+    for RecordedVehicle { config, tables } in vehicles {
         let pipeline = Pipeline::new(&config, tables.clone())?;
         replays.push(VehicleReplay {
-            name: vehicle.name.as_str().into(),
-            config,
+            name: config.name.as_str().into(),
             tables,
             pipeline: is_first_part.then_some(pipeline),
             warm_up: None,
-            valid_ms: vehicle.maps.valid_ms,
+            valid_ms: config.maps.valid_ms,
+            config,
             records: recording.maps(),
             next_event: is_first_part.then_some(0),
             lacks_events: false,
