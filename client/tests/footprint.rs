@@ -1,7 +1,5 @@
 //! Free footprints and nearest obstacles, compared with a search over all points.
 
-mod common;
-
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use bytes::Bytes;
@@ -12,6 +10,8 @@ use clearway_proto::legend::encode_legend;
 use clearway_proto::map::{encode_header, encode_layer};
 use clearway_proto::v1::ClassMeaning;
 use proptest::prelude::*;
+
+use crate::common;
 
 const SIDE: u32 = 6;
 const ROW_RADII_M: [f32; 3] = [0.6, 1.3, 2.5];

@@ -1,7 +1,5 @@
 //! The gRPC client with a scripted service in this process.
 
-mod common;
-
 use std::pin::Pin;
 use std::sync::Mutex;
 
@@ -10,11 +8,12 @@ use clearway_client::{Client, ClientError, Subscription, v1};
 use clearway_proto::codec::Limits;
 use clearway_proto::delta::encode_delta;
 use clearway_proto::map::{encode_header, encode_layer};
-use common::{CAPTURE_END_NS, map};
 use futures::{Stream, stream};
 use prost::Message;
 use tokio::sync::mpsc;
 use tonic::{Request, Response, Status, Streaming};
+
+use crate::common::{CAPTURE_END_NS, map};
 
 type Updates = Vec<Result<v1::MapUpdate, Status>>;
 

@@ -1,9 +1,8 @@
 //! Look-ups at points in metres, and the age of a map.
 
-mod common;
-
 use clearway_client::{ClientError, MapView};
-use common::{CAPTURE_END_NS, map};
+
+use crate::common::{CAPTURE_END_NS, map};
 
 fn view() -> MapView {
     MapView::decode(map(5, CAPTURE_END_NS)).unwrap()

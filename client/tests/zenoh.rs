@@ -1,19 +1,18 @@
 //! The zenoh client with a zenoh session in this process.
 
-mod common;
-
 use std::sync::Arc;
 
 use bytes::Bytes;
 use clearway_client::signature::{PublicKey, SigningKey};
 use clearway_client::{MapStream, PassedOver, StreamEvent, Update, ZenohClient, now_ns, v1};
-use common::{CAPTURE_END_NS, map};
 use prost::Message;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{RwLock, watch};
 use zenoh::Session;
 use zenoh::sample::SourceInfo;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, z_serialize};
+
+use crate::common::{CAPTURE_END_NS, map};
 
 const KEY: &str = "clearway/alpha/map/drivability";
 

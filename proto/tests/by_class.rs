@@ -1,17 +1,16 @@
 //! Channels with a class table: shorter, and with the same cells.
 
-mod common;
-
 use bytes::Bytes;
 use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{Cells, CellsRef, Limits, encode_grid};
 use clearway_proto::delta::encode_delta;
 use clearway_proto::map::{Map, decode_map, decode_map_on, encode_header, encode_layer};
 use clearway_proto::v1::{self, ClassMeaning};
-use common::{assert_golden, with_legend};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use prost::Message;
+
+use crate::common::{assert_golden, with_legend};
 
 const CLASSES: [(&str, ClassMeaning, u32); 4] = [
     ("unknown", ClassMeaning::Unknown, 0x3a3f46),

@@ -1,7 +1,5 @@
 //! Deltas and regions. A delta applied to its base gives the whole layer; applied to anything else it is refused.
 
-mod common;
-
 use bytes::Bytes;
 use clearway_proto::codec::{Cells, CellsRef, Limits, encode_grid};
 use clearway_proto::delta::encode_delta;
@@ -10,10 +8,11 @@ use clearway_proto::map::{self, Channel, Map, MapError, decode_map, decode_map_o
 use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1::layer::Geometry;
 use clearway_proto::v1::{self, ClassMeaning};
-use common::{assert_golden, bless, hex, pretty, with_legend};
 use proptest::prelude::*;
 use prost::Message;
 use serde_json::json;
+
+use crate::common::{assert_golden, bless, hex, pretty, with_legend};
 
 const LIMITS: fn() -> Limits = Limits::default;
 

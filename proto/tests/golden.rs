@@ -1,16 +1,15 @@
 //! The golden vectors in `golden/`: the encoder writes exactly these files, and the decoder accepts or refuses their
 //! contents by name. Clients in other languages read the same files. `CLEARWAY_BLESS=1` writes them again.
 
-mod common;
-
 use bytes::Bytes;
 use clearway_proto::codec::{self, Cells, Limits};
 use clearway_proto::legend::encode_legend;
 use clearway_proto::v1::ClassMeaning;
 use clearway_proto::{limits, map, safe_points, v1};
-use common::{assert_golden, bless, golden, hex, pretty, with_legend};
 use prost::Message;
 use serde_json::{Value, json};
+
+use crate::common::{assert_golden, bless, golden, hex, pretty, with_legend};
 
 fn unhex(text: &str) -> Vec<u8> {
     (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).unwrap()).collect()

@@ -1,12 +1,11 @@
 //! The command `clearway`, run as a user runs it.
 
-mod common;
-
 use std::path::Path;
 use std::process::{Command, Output};
 
-use common::{clearway, text};
 use serde_json::Value;
+
+use crate::common::{clearway, text};
 
 /// Runs `clearway` in a folder.
 fn clearway_in(folder: &Path, arguments: &[&str]) -> Output {

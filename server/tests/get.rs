@@ -1,16 +1,15 @@
 //! `clearway get` reads the newest map of a scripted service.
 
-mod common;
-
 use std::pin::Pin;
 
 use clearway_client::{now_ns, v1};
 use clearway_proto::v1::map_service_server::{MapService, MapServiceServer};
-use common::{CAPTURE_END_NS, clearway, map, text};
 use futures::Stream;
 use prost::Message;
 use serde_json::Value;
 use tonic::{Request, Response, Status, Streaming};
+
+use crate::common::{CAPTURE_END_NS, clearway, map, text};
 
 /// A service that has one map for each of two vehicles: `alpha` captured it years ago, `fresh` captures it now.
 struct TwoVehicles;

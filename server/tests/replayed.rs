@@ -1,12 +1,10 @@
 //! `clearway replay` as a command: how it ends, what it refuses, and what it says of several vehicles.
 
-mod common;
-
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use common::{clearway, text};
+use crate::common::{clearway, text};
 
 const TOWN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../client/golden/town.mcap");
 

@@ -1,12 +1,11 @@
 //! `clearway send` sends a capture that the test writes to sockets of the test.
 
-mod common;
-
 use std::net::UdpSocket;
 use std::time::Duration;
 
-use common::{clearway, text};
 use serde_json::Value;
+
+use crate::common::{clearway, text};
 
 /// A pcap file of Ethernet frames with one UDP datagram each.
 fn pcap(payloads: &[Vec<u8>]) -> Vec<u8> {

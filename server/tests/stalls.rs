@@ -1,7 +1,5 @@
 //! A server that stands still, that hangs, that has no data and that is gone, as planners and people see it.
 
-mod common;
-
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
@@ -18,7 +16,8 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
 use clearway_sim::send::{Pace, Until, drive};
 use clearway_sim::vehicle::SimulatedVehicle;
-use common::text;
+
+use crate::common::text;
 
 /// Longest wait, so that a test that hangs ends: ten times what any step of these tests needs.
 const PATIENCE: Duration = Duration::from_secs(120);

@@ -1,18 +1,15 @@
 //! `clearway verify` as a tool for CI: many recordings, shards, reports, and what a change changes.
 
-mod common;
-#[path = "common/copied.rs"]
-mod copied;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
-use common::{clearway, text};
-use copied::copy;
 use prost::Message;
 use serde_json::Value;
+
+use crate::common::copied::copy;
+use crate::common::{clearway, text};
 
 /// The golden recording: a VLP-16 in the simulated town, 10 maps.
 fn town() -> PathBuf {

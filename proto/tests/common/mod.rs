@@ -1,5 +1,4 @@
 //! Reads the files in `golden/`, and writes them if `CLEARWAY_BLESS=1` is set.
-#![allow(dead_code, reason = "each test file uses a part of it")]
 
 use std::path::PathBuf;
 

@@ -1,7 +1,6 @@
 //! A map with known classes, and the binary `clearway`.
 
-// Each test file uses a part of this.
-#![allow(dead_code, unused_imports)]
+pub mod copied;
 
 use std::process::{Command, Output};
 
@@ -9,6 +8,8 @@ pub use fixture::{CAPTURE_END_NS, CLASSES, map};
 
 #[path = "../../../client/tests/common/mod.rs"]
 mod fixture;
+#[path = "../../../tests/tests/fixture/venv.rs"]
+pub mod venv;
 
 pub fn clearway(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_clearway")).args(arguments).output().unwrap()

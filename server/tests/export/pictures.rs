@@ -5,8 +5,8 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
-use super::common::{clearway, text};
 use super::{folder, record};
+use crate::common::{clearway, text};
 
 /// Width, height, red, green and blue of each pixel, and the texts by keyword, of a picture.
 fn decoded(file: &Path) -> (usize, usize, Vec<[u8; 3]>, BTreeMap<String, String>) {

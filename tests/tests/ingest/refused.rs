@@ -13,8 +13,8 @@ use clearway_proto::v1;
 use prost::Message;
 use tonic::Code;
 
-use super::fixture::{recorded, within};
 use super::{client, ingester, plain, reports, scan, scanned_config, start};
+use crate::fixture::{recorded, within};
 
 /// `scan` with the x of its last point replaced.
 fn with_last_x(scan: v1::Scan, last: f32) -> v1::Scan {

@@ -7,8 +7,8 @@ use clearway_tests::attack::http2;
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;
 
-use super::fixture::{until, within};
 use super::{ingester, plain, scanned_config, send_all_from_a_task, start};
+use crate::fixture::{until, within};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_peer_without_a_window_for_reports_keeps_no_time_of_the_engine() {

@@ -4,8 +4,8 @@ use clearway_client::observation::Observation;
 use clearway_proto::packed::unpack;
 use clearway_proto::v1;
 
-use super::fixture::within;
 use super::{ingester, plain, scanned_config, send_all, start};
+use crate::fixture::within;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn two_clients_of_one_sensor_are_named_in_the_status() {

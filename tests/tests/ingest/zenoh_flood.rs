@@ -10,8 +10,8 @@ use prost::Message;
 use zenoh::qos::CongestionControl;
 use zenoh::sample::SourceInfo;
 
-use super::fixture::{until, within};
 use super::{scan, scanned_config, send_all, start};
+use crate::fixture::{until, within};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_flood_of_large_scans_over_zenoh_costs_another_session_no_observation() {

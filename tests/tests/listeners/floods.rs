@@ -8,8 +8,8 @@ use clearway_tests::attack::http2::{self, frame};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use super::fixture::{self, PING, feed, readings, start, within};
 use super::{everything, metric};
+use crate::fixture::{self, PING, feed, readings, start, within};
 
 const LIST: &str = "/clearway.v1.MapService/ListVehicles";
 

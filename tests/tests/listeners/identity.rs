@@ -7,10 +7,10 @@ use std::path::Path;
 use clearway_client::{Client, ClientError, Subscription, Tls};
 use clearway_daemon::config::Only;
 
-use super::fixture::certificates::{TOKEN, certificates, secured, start, with_roles};
-use super::fixture::https::ask;
-use super::fixture::{feed, readings, within};
 use super::get;
+use crate::fixture::certificates::{TOKEN, certificates, secured, start, with_roles};
+use crate::fixture::https::ask;
+use crate::fixture::{feed, readings, within};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]

@@ -1,7 +1,7 @@
 //! What browsers are answered: methods, hosts, origins, headers.
 
-use super::fixture::{start, within};
 use super::{ask, everything, get};
+use crate::fixture::{start, within};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn only_get_and_head_from_the_page_itself_are_answered() {

@@ -13,7 +13,7 @@ use clearway_daemon::run::{Running, Server, Setup};
 use clearway_daemon::status::Transport;
 use tokio::runtime::Runtime;
 
-use crate::webdriver::Browser;
+use crate::page::webdriver::Browser;
 
 const VEHICLES: usize = 50;
 /// Fifty vehicles send once a second, and the browser takes most of the machine.

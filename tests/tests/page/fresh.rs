@@ -8,7 +8,7 @@ use clearway::cli::make::demo::report::{Report, Summary};
 use clearway::cli::make::demo::sensors::Sensors;
 use clearway::cli::make::demo::{Endpoints, Options, demo};
 
-use crate::webdriver::Browser;
+use crate::page::webdriver::Browser;
 
 /// How long the page may take to its first map: it starts together with the car.
 const START_MAX: Duration = Duration::from_secs(30);

@@ -7,7 +7,7 @@ use clearway_client::test::{Replay, town};
 use clearway_client::{Client, MapView};
 use clearway_proto::v1;
 
-use crate::webdriver::Browser;
+use crate::page::webdriver::Browser;
 
 /// Chooses every layer: the first as the shown one, all others over it.
 const ALL_LAYERS: &str = "document.querySelector('.layer input[type=radio]').click();

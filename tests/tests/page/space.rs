@@ -2,8 +2,8 @@
 
 use clearway::cli::make::demo::sensors::Sensors;
 
-use crate::fresh::RunningDemo;
-use crate::webdriver::Browser;
+use crate::page::fresh::RunningDemo;
+use crate::page::webdriver::Browser;
 
 /// Draws the view in 3-D again, and counts the colours of its pixels in `window.colours`: they can be read only in the
 /// display frame in which they are drawn.

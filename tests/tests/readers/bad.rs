@@ -11,8 +11,8 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 
-use super::fixture::{self, config, feed, sequence, start, until, within};
 use super::{Reader, keeps_up, of_layer, plain, portions};
+use crate::fixture::{self, config, feed, sequence, start, until, within};
 
 /// A link from the server that passes only the allowed number of bytes.
 pub struct Link {

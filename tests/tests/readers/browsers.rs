@@ -11,8 +11,8 @@ use tokio::net::TcpStream;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
 use super::bad::Link;
-use super::fixture::{PING, config, feed, frame, grpc, pong, sequence, start, until, web_socket, within};
 use super::{LAYER, portions};
+use crate::fixture::{PING, config, feed, frame, grpc, pong, sequence, start, until, web_socket, within};
 
 /// A browser's WebSocket: it reads and answers pings by itself, whatever the page does.
 struct Browser {

@@ -1,7 +1,5 @@
 //! Memory of ground and obstacles, with simulated drives past recorded truth.
 
-mod common;
-
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event};
@@ -12,7 +10,8 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::truth::{Limits, Truth};
 use clearway_sim::vehicle::SimulatedVehicle;
-use common::*;
+
+use crate::common::*;
 
 const POSE_PERIOD_NS: i64 = 10_000_000;
 

@@ -1,7 +1,5 @@
 //! The pipeline: what it counts, what it refuses, and that the same events give the same maps.
 
-mod common;
-
 use bytes::Bytes;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{BodyConfig, ConfigValueError, Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
@@ -15,6 +13,8 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+
+use crate::common;
 
 fn config(model: Option<Model>) -> VehicleConfig {
     let level = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };

@@ -2,7 +2,7 @@
 
 use clearway_lidar::{Clock, Model, Revolution, Sensor, SensorConfig};
 
-use crate::{against, archive, data, decode_capture, distance_m, points, spread};
+use crate::world::{against, archive, data, decode_capture, distance_m, points, spread};
 
 const CAPTURE: &str = "pcap/rust-lidar-utils/hdl32_example.pcap";
 

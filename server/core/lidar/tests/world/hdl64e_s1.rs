@@ -4,7 +4,7 @@ use std::io::Read;
 
 use clearway_lidar::{Calibration, Model, ReturnMode, SensorConfig};
 
-use crate::{archive, data, decode_capture, distance_m, points, spread};
+use crate::world::{archive, data, decode_capture, distance_m, points, spread};
 
 const CAPTURE: &str = "pcap/opendlv/proxy-velodyne64/cut_for_developers/atwall_first174packets.pcap";
 /// Index of the return of the capture at which the frame of VeloView begins.

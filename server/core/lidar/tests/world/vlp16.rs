@@ -2,7 +2,7 @@
 
 use clearway_lidar::{Clock, Model, Point, ReturnMode, Revolution, SensorConfig};
 
-use crate::{against, archive, data, decode, decode_capture, distance_m, mcap_packets, points, spread};
+use crate::world::{against, archive, data, decode, decode_capture, distance_m, mcap_packets, points, spread};
 
 const ON_A_CAR: &str = "pcap/opendlv/proxy-velodyne16/sampleShort.pcap";
 /// Index of the return of the capture at which the frame of VeloView begins.

@@ -2,7 +2,7 @@
 
 use clearway_lidar::{Model, ReturnMode, SensorConfig};
 
-use crate::{against, archive, decode, mcap_packets, points, spread};
+use crate::world::{against, archive, decode, mcap_packets, points, spread};
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]

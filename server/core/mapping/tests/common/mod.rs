@@ -1,5 +1,4 @@
 //! Sweeps for the tests: rays of a real sensor model cast into simple worlds, and recorded scans.
-#![allow(dead_code)]
 
 pub mod labels;
 pub mod opencalib;

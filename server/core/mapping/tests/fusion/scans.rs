@@ -1,6 +1,7 @@
 //! Scan events: motion compensation of their points, which scans are refused, and what defines the rows of radial maps.
 
 use super::*;
+use crate::common;
 
 #[test]
 fn each_point_of_a_scan_is_moved_from_its_own_time() {

@@ -1,0 +1,8 @@
+//! Tests of the client library, with maps of known classes and scripted services.
+
+mod common;
+mod footprint;
+mod stream;
+mod view;
+#[cfg(feature = "zenoh")]
+mod zenoh;

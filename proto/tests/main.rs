@@ -1,0 +1,7 @@
+//! Tests of the map codec and of the golden vectors.
+
+mod by_class;
+mod codec;
+mod common;
+mod delta;
+mod golden;

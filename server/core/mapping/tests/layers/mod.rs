@@ -1,0 +1,10 @@
+//! Each layer by its paper, and what every layer guarantees.
+
+mod contract;
+mod criteria;
+mod occupancy;
+mod properties;
+mod safe_path;
+mod scenes;
+mod speed;
+mod terrain;

@@ -1,0 +1,5 @@
+//! Several servers and vehicles in one network.
+
+mod fleet;
+mod machines;
+mod servers;

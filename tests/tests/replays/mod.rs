@@ -1,0 +1,6 @@
+//! Recorded drives through the whole system.
+
+mod determinism;
+mod evaluate;
+mod replay;
+mod transport;
