@@ -1,7 +1,7 @@
 //! Who may do what, on every listener: each call and key against each kind of client. The table stands in SECURITY.md,
 //! and this test holds it equal to what a server with certificates and roles does.
 //!
-//! A new row is one line in [`rows`]. `CLEARWAY_BLESS=1 cargo test --test access` writes the table.
+//! A new row is one line in [`rows`]. `CLEARWAY_BLESS=1 cargo test --test system access` writes the table.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -27,7 +27,7 @@ use crate::fixture::certificates::{TOKEN, certificates, start, with_roles, zenoh
 use crate::fixture::{Driving, https, until, within};
 
 const SECURITY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../SECURITY.md");
-const BEGIN: &str = "<!-- The table is written by tests/tests/access.rs. -->\n";
+const BEGIN: &str = "<!-- The table is written by tests/tests/listeners/access.rs. -->\n";
 const END: &str = "<!-- End of the table. -->";
 
 /// Errors that only those get that may make a call: it lacks content, or the server has no recorder or replay.

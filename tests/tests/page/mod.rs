@@ -1,9 +1,9 @@
 //! The page in a real browser. Screenshots are kept in `target/page`.
 //!
-//! `CLEARWAY_PAGE_SECONDS=300 cargo test --release -p clearway-tests --test page -- --nocapture` looks at the page
-//! beside the demo for five minutes, 100 times, and asserts that the map is fresh in 95 of them. Without the variable
-//! the test looks 20 times, and asserts that the page shows a fresh map at all and that its console has no errors: a
-//! debug build, a simulated sensor and a browser on two shared cores need not keep up.
+//! `CLEARWAY_PAGE_SECONDS=300 cargo test --release -p clearway-tests --test system page -- --nocapture` looks at the
+//! page beside the demo for five minutes, 100 times, and asserts that the map is fresh in 95 of them. Without the
+//! variable the test looks 20 times, and asserts that the page shows a fresh map at all and that its console has no
+//! errors: a debug build, a simulated sensor and a browser on two shared cores need not keep up.
 
 #[cfg(clearway_browser)]
 mod fleet;

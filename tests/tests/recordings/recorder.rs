@@ -25,7 +25,7 @@ use tonic::transport::Channel;
 use crate::fixture::copied::copy;
 use crate::fixture::{self, config, feed, readings, until, within};
 
-/// Number of servers that are killed; 200 by `CLEARWAY_KILLS=200 cargo test --release --test recorder kill`.
+/// Number of servers that are killed; 200 by `CLEARWAY_KILLS=200 cargo test --release --test system kill`.
 fn kills() -> usize {
     std::env::var("CLEARWAY_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(20)
 }

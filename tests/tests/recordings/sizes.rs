@@ -1,6 +1,6 @@
 //! The sizes of the maps of recorded and simulated drives: for each layer and channel, as a whole map and as a delta to
 //! the map before.
-//! `cargo test -p clearway-tests --test sizes -- --nocapture` prints the table.
+//! `cargo test -p clearway-tests --test system sizes -- --nocapture` prints the table.
 
 #![cfg_attr(not(clearway_data), allow(unused))]
 
