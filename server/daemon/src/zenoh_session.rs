@@ -66,8 +66,8 @@ impl ZenohError {
 }
 
 /// The settings of the session. Without access control in the file of `[zenoh]`, no peer may publish what the server
-/// publishes of its `vehicles` ([`own_keys`]). A message of a peer may be twice as long as `observation_bytes_max`, and
-/// [`MESSAGE_BYTES_MAX`] in any case.
+/// publishes of its `vehicles` ([`own_keys`]), beside the downsampling of that file. A message of a peer may be twice as
+/// long as `observation_bytes_max`, and [`MESSAGE_BYTES_MAX`] in any case.
 ///
 /// # Errors
 /// [`ZenohError`] if the settings are invalid or the file of `[zenoh]` cannot be read.
@@ -79,7 +79,10 @@ pub fn settings<'a>(
     let mut config = session_config(options, MESSAGE_BYTES_MAX.max(2 * observation_bytes_max))?;
     if config.get_json("access_control/enabled").is_ok_and(|enabled| enabled != "true") {
         let own_keys = own_keys(vehicles);
-        for (key, value) in [("access_control", deny_put(&own_keys)), ("downsampling", drop_put(&own_keys))] {
+        let of_file = config.get_json("downsampling").ok().and_then(|json| serde_json::from_str(&json).ok());
+        let mut downsampling: Vec<serde_json::Value> = of_file.unwrap_or_default();
+        downsampling.push(drop_put(&own_keys));
+        for (key, value) in [("access_control", deny_put(&own_keys)), ("downsampling", downsampling.into())] {
             config.insert_json5(key, &value.to_string()).map_err(ZenohError::of(key))?;
         }
     }
@@ -266,9 +269,9 @@ fn deny_put(keys: &[String]) -> serde_json::Value {
 /// routed, so that a flood of it costs no reader anything.
 fn drop_put(keys: &[String]) -> serde_json::Value {
     let rules: Vec<_> = keys.iter().map(|key| serde_json::json!({ "key_expr": key, "freq": 0.0 })).collect();
-    serde_json::json!([{
+    serde_json::json!({
         "id": "publish as the server", "messages": ["put", "delete"], "flows": ["ingress"], "rules": rules,
-    }])
+    })
 }
 
 /// zenoh's default settings with [`LIMITS`].
@@ -294,6 +297,19 @@ mod tests {
                 assert_eq!(config.get_json(key).unwrap(), limited.get_json(key).unwrap(), "{name}: {key}");
             }
         }
+    }
+
+    #[test]
+    fn the_downsampling_of_a_zenoh_file_stays_beside_that_of_the_server() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("thin.json5");
+        let rule = r#"{ id: "thin", messages: ["put"], flows: ["egress"], rules: [{ key_expr: "a/b", freq: 4.0 }] }"#;
+        std::fs::write(&file, format!("{{ downsampling: [{rule}] }}")).unwrap();
+        let config = settings(&Options { file, ..Options::default() }, 0, ["car"].into_iter()).unwrap();
+        let rules: serde_json::Value = serde_json::from_str(&config.get_json("downsampling").unwrap()).unwrap();
+        let ids: Vec<_> = rules.as_array().unwrap().iter().map(|rule| rule["id"].as_str().unwrap()).collect();
+        assert_eq!(ids, ["thin", "publish as the server"], "{rules}");
+        assert_eq!(rules[0]["rules"][0]["freq"], 4.0, "{rules}");
     }
 
     #[test]
