@@ -54,7 +54,7 @@ pub enum Role {
     /// Prints of each map of a layer, and when the newest becomes stale: the vehicle, `fresh` or why it is stale, its
     /// age in ms, its bytes, `whole` or `delta`.
     Ages {
-        /// Endpoints of routers; the first that answers is used. Or `grpc:` and the address of a server, for deltas.
+        /// Endpoints of routers, as `ZenohClient::connect` takes them. Or `grpc:` and the address of a server, for deltas.
         endpoints: String,
         /// Names of the vehicles.
         vehicles: String,
@@ -63,7 +63,7 @@ pub enum Role {
     },
     /// Prints when a stream becomes stale, and why, or fresh, or changes its server.
     Read {
-        /// Endpoints of routers; the first that answers is used.
+        /// Endpoints of routers, as `ZenohClient::connect` takes them.
         endpoints: String,
         /// Names of the vehicles.
         vehicles: String,

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 from .errors import ClearwayError
 from .map import Map
 from .signature import PublicKey
-from .standby import Arrivals, Standby
 from .stream import MapStream
 from .tls import Tls
 from .v1 import map_pb2
@@ -31,6 +30,9 @@ if TYPE_CHECKING:
     import zenoh.ext
 
 _TIMEOUT_S = 5.0
+#: Time until the next attempt to open a session; longest time for an endpoint to answer, in ms, in the first attempt and
+#: in the attempts after it.
+_OPEN_RETRY_S, _OPEN_TIMEOUT_MS = 0.2, (500, 2000)
 #: Most gaps kept between two samples. If there are more (the process was suspended), the first count as skipped and not
 #: as lost.
 _MISSES_KEPT = 1024
@@ -42,13 +44,12 @@ _MAPS_BEGUN_MAX = 16
 _LAST_MAP_S = 1.0
 #: Settings of every session; client/src/zenoh.rs has the reasons.
 _SETTINGS = {
-    "mode": "client",
     "listen/endpoints": [],
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
-    "connect/timeout_ms": 5000,
+    "connect/timeout_ms": 0,
+    "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
-    "transport/unicast/open_timeout": 2000,
     "transport/link/tx/lease": 2000,
     "transport/link/rx/max_message_size": 16777216,
     "transport/link/tcp": {"so_rcvbuf": 262144},
@@ -58,24 +59,33 @@ _CERTIFICATES = {"ca": "root_ca_certificate", "cert": "connect_certificate", "ke
 
 
 def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
+    """A session at the first of several endpoints `A,B` that answers, or at all of `A+B`."""
     try:
         import zenoh
     except ImportError:
         raise ClearwayError("zenoh", "zenoh is not installed: pip install 'clearway[zenoh]'") from None
     encrypted = {"so_rcvbuf": 262144}
+    endpoints = endpoint.split("+" if "+" in endpoint else ",")
     if tls is not None:
-        if not all(one.startswith("tls/") for one in endpoint.split(",")):
+        if not all(one.startswith("tls/") for one in endpoints):
             raise ClearwayError("certificate", f"zenoh:{endpoint}: certificates are for zenoh:tls/HOST:PORT")
         files = {_CERTIFICATES[name]: path for name, path in tls.files().items()}
         # Without this setting the client presents no certificate.
         encrypted |= files | {"enable_mtls": tls.cert is not None}
+    of_endpoint = {"mode": "peer" if "+" in endpoint else "client", "connect/endpoints": endpoints}
     config = zenoh.Config()
-    for key, value in (_SETTINGS | {"connect/endpoints": endpoint.split(","), "transport/link/tls": encrypted}).items():
+    for key, value in (_SETTINGS | of_endpoint | {"transport/link/tls": encrypted}).items():
         config.insert_json5(key, json.dumps(value))
-    try:
-        return zenoh.open(config)
-    except Exception as error:
-        raise ClearwayError("zenoh", f"connect to {endpoint}: {error}") from None
+    until, (open_timeout_ms, longest_ms) = time.monotonic() + _TIMEOUT_S, _OPEN_TIMEOUT_MS
+    while True:
+        config.insert_json5("transport/unicast/open_timeout", str(open_timeout_ms))
+        try:
+            return zenoh.open(config)
+        except Exception as error:
+            if time.monotonic() >= until:
+                raise ClearwayError("zenoh", f"connect to {endpoint}: {error}") from None
+        time.sleep(_OPEN_RETRY_S)
+        open_timeout_ms = min(2 * open_timeout_ms, longest_ms)
 
 
 def vehicles(endpoint: str, tls: Tls | None) -> list[str]:
@@ -154,17 +164,11 @@ def watch(
 ) -> MapStream:
     server = None if signed_by is None else PublicKey(signed_by)
     session = _session(endpoint, tls)
-    stream, arrivals = MapStream(), Arrivals()
+    stream = MapStream()
     threads: list[threading.Thread] = []
-
-    def subscribe(session: zenoh.Session, arrivals: Arrivals) -> list[threading.Thread]:
-        writer = _StreamWriter(stream, layers, arrivals)
-        keys = [_LayerKey(vehicle, layer, server) for layer in writer.layers]
-        return [thread for key in keys for thread in _LayerSubscription(session, key, writer).threads]
 
     def close() -> None:
         atexit.unregister(close)
-        arrivals.end()
         session.close()
         # The garbage collector may call this from one of them.
         for thread in threads:
@@ -175,10 +179,9 @@ def watch(
     atexit.register(close)
     stream.on_close(close)
     try:
-        threads += subscribe(session, arrivals)
-        endpoints = endpoint.split(",")
-        if len(endpoints) > 1:
-            threads.append(Standby(session, arrivals, endpoints, lambda one: _session(one, tls), subscribe).thread)
+        writer = _StreamWriter(stream, layers)
+        for layer in writer.layers:
+            threads += _LayerSubscription(session, _LayerKey(vehicle, layer, server), writer).threads
         threads.append(_ReplaySubscription(session, f"clearway/{vehicle}/replay", stream).thread)
     except Exception as error:
         close()
@@ -291,9 +294,8 @@ class _ReplaySubscription:
 class _StreamWriter:
     """Parts of maps from one thread per layer -> a stream."""
 
-    def __init__(self, stream: MapStream, layers: Sequence[str], arrivals: Arrivals) -> None:
+    def __init__(self, stream: MapStream, layers: Sequence[str]) -> None:
         self._stream, self._collector, self._lock = stream, _LayerCollector(layers), threading.Lock()
-        self._arrivals = arrivals
         self.layers = list(dict.fromkeys(layers))
         #: Samples missed of each layer since the last complete map.
         self._missed = dict.fromkeys(self.layers, 0)
@@ -312,7 +314,6 @@ class _StreamWriter:
             return False
         with self._lock:
             for whole in self._collector.add(*part):
-                self._arrivals.add()
                 # A missed map that was queried has arrived, so it is not a skipped one.
                 if self._stream.store(Map(whole), None, lost=max(self._missed.values())):
                     self._missed = dict.fromkeys(self.layers, 0)

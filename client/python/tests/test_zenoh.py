@@ -123,14 +123,13 @@ def lone_routers():
         session.close()
 
 
-def test_a_reader_that_knows_two_routers_reads_through_the_second_while_the_first_has_no_maps(lone_routers):
+def test_a_reader_at_two_routers_at_once_reads_through_either(lone_routers):
     (first, near), (second, far) = lone_routers
     layers = ["drivability", "terrain"]
     publishers = [published(second, layer) for layer in layers]
     for publisher, layer in zip(publishers, layers):
         publisher.put(part(1, layer))
-    # The session is at the router that answers first, so the other order has the other router.
-    for endpoints in (f"{near},{far}", f"{far},{near}"):
+    for endpoints in (f"{near}+{far}", f"{far}+{near}"):
         with watch(endpoints, *layers) as maps:
             assert counts(next(maps)) == (1, 0, 0), endpoints
     # A reader that knows one router waits there.
@@ -138,6 +137,15 @@ def test_a_reader_that_knows_two_routers_reads_through_the_second_while_the_firs
         of_first = published(first)
         of_first.put(part(2))
         assert counts(next(maps)) == (2, 0, 0)
+
+
+def test_a_dead_router_before_a_live_one_costs_a_reader_no_maps(lone_routers):
+    (first, near), (second, far) = lone_routers
+    first.close()
+    published(second).put(part(1))
+    for endpoints in (f"{near},{far}", f"{near}+{far}"):
+        with watch(endpoints) as maps:
+            assert counts(next(maps)) == (1, 0, 0), endpoints
 
 
 @pytest.mark.parametrize("ending", ["", "maps.close()", "raise SystemExit(3)"], ids=["end", "close", "exit"])

@@ -11,9 +11,8 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
-use std::time::{Duration, Instant};
 
-use tokio::sync::watch;
+use tokio::sync::oneshot;
 use zenoh::pubsub::Subscriber;
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::sample::{Sample, SampleKind};
@@ -23,41 +22,17 @@ use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig,
 use crate::stream::{LatestSlot, Missed};
 use crate::zenoh::query::{LayerKey, QUERY_TIMEOUT};
 
-/// The maps that a subscription has brought.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Arrivals {
-    pub count: u64,
-    /// When the last map came, or the subscription began.
-    pub at: Instant,
-    /// Time between two maps, smoothed.
-    pub period: Duration,
-}
-
-/// Time between two maps before it is known, and the longest that counts.
-const PERIOD: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(1));
-
-impl Arrivals {
-    fn add(&mut self) {
-        let (now, smoothing) = (Instant::now(), 5);
-        if self.count > 0 {
-            let passed = now.saturating_duration_since(self.at).min(PERIOD.1);
-            self.period = (self.period * (smoothing - 1) + passed) / smoothing;
-        }
-        (self.count, self.at) = (self.count + 1, now);
-    }
-}
-
 /// A subscription to the key of one layer, which stores the newest map in a slot.
 pub(super) struct LayerSubscription {
     /// Its sender lives in the subscriber's callback, and so as long as the session.
-    arrivals: watch::Receiver<Arrivals>,
+    open: oneshot::Receiver<()>,
     _subscriber: AdvancedSubscriber<()>,
     _heartbeats: Subscriber<()>,
 }
 
 impl LayerSubscription {
     pub async fn open(session: &Session, layer: LayerKey, slot: LatestSlot) -> zenoh::Result<Self> {
-        let (arrives, arrivals) = watch::channel(Arrivals { count: 0, at: Instant::now(), period: PERIOD.0 });
+        let (held, open) = oneshot::channel();
         let key = layer.key.clone();
         // Samples missed since the newest map.
         let missed = Arc::new(AtomicU64::new(0));
@@ -67,6 +42,7 @@ impl LayerSubscription {
         let declaration = session.declare_subscriber(key.clone()).callback({
             let (missed, number, slot, layer) = (missed.clone(), number.clone(), slot.clone(), layer.clone());
             move |sample| {
+                let _lives_with_the_callback = &held;
                 if sample.kind() != SampleKind::Put {
                     return;
                 }
@@ -75,9 +51,6 @@ impl LayerSubscription {
                     let lost = skipped.min(missed.swap(0, Ordering::Relaxed));
                     Missed { skipped, lost, left_out: 0 }
                 });
-                if is_stored {
-                    arrives.send_modify(Arrivals::add);
-                }
                 if let Some(source) = sample.source_info().filter(|_| is_stored) {
                     number.store(source.source_sn(), Ordering::Relaxed);
                 }
@@ -116,18 +89,13 @@ impl LayerSubscription {
             }
         });
         let heartbeats = heartbeats.await?;
-        Ok(Self { arrivals, _subscriber: subscriber, _heartbeats: heartbeats })
-    }
-
-    /// The maps that it has brought; the sender is dropped with the session.
-    pub fn arrivals(&self) -> watch::Receiver<Arrivals> {
-        self.arrivals.clone()
+        Ok(Self { open, _subscriber: subscriber, _heartbeats: heartbeats })
     }
 
     /// Waits until the session is closed.
-    pub async fn closed(&self) {
-        let mut arrivals = self.arrivals.clone();
-        while arrivals.changed().await.is_ok() {}
+    pub async fn closed(self) {
+        // The sender is dropped without a message.
+        let _ = self.open.await;
     }
 }
 

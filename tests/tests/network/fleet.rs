@@ -135,6 +135,24 @@ async fn streams_through_a_router_survive_a_restart_of_the_router() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_dead_router_before_a_live_one_costs_a_planner_no_maps() {
+    let (router, at) = router(0, &[]).await;
+    let running = behind(&at).await;
+    let mut made = 0;
+    while made == 0 {
+        made = feed(&running, readings(2)).await;
+    }
+    // Nothing listens there now.
+    let dead = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    for separator in [",", "+"] {
+        let (_client, mut maps) = planner(&format!("tcp/{dead}{separator}{at}")).await;
+        Given::default().receive_up_to(made - 1, &mut maps).await;
+    }
+    within("shutdown", running.shutdown()).await.unwrap();
+    router.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_layer_without_subscribers_is_made_at_once_for_a_new_planner() {
     let mut config = config();
     config.zenoh.enabled = true;
