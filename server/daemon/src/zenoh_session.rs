@@ -4,6 +4,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use zenoh::bytes::Encoding;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
 use zenoh::session::ZenohId;
 use zenoh::{Config, Session};
 
@@ -116,6 +119,21 @@ pub(crate) async fn open(config: Config, options: &Options) -> Result<Session, Z
 /// The endpoints the session listens on, with the ports that the system chose.
 pub(crate) async fn endpoints(session: &Session) -> Vec<String> {
     session.info().locators().await.iter().map(ToString::to_string).collect()
+}
+
+/// Declares a publisher whose messages are dropped for a peer that does not receive them.
+///
+/// # Errors
+/// [`ZenohError`] if it cannot be declared.
+pub(crate) async fn declare_publisher(
+    session: &Session,
+    key: String,
+    encoding: Encoding,
+    priority: Priority,
+) -> Result<Publisher<'static>, ZenohError> {
+    let publisher = session.declare_publisher(key.clone()).encoding(encoding).priority(priority);
+    let publisher = publisher.congestion_control(CongestionControl::Drop).await;
+    publisher.map_err(ZenohError::of(format!("publisher {key}")))
 }
 
 /// The names in the certificates of the peers at the other end of this session's links.

@@ -6,10 +6,12 @@
 //! | `sync` | a mutex -> its value, also after a panic |
 //! | [`directory`] | the name of a vehicle -> what is served for it |
 //! | [`held_sockets`] | sockets that systemd holds -> listeners |
+//! | `token_bucket` | messages of a client -> whether its rate is within a limit |
 
 pub mod clock;
 pub mod directory;
 pub mod held_sockets;
 pub mod sync;
+pub mod token_bucket;
 
 pub use clearway_journal::{counted, file_advice};

@@ -13,7 +13,7 @@ pub struct Store {
     /// True if each part is deleted from the recorder's folder after the store has confirmed it, once it is older than
     /// `recorder.save_s`.
     pub delete: bool,
-    /// Most that uploads to a bucket send, in kbit/s; 0: without this limit. Below it they give way to maps.
+    /// Most that uploads to a bucket send, in kbit/s; 0: no limit.
     pub upload_kbit_s_max: u32,
 }
 

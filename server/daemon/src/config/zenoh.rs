@@ -1,6 +1,8 @@
 //! The table `[zenoh]`: the session in which maps are published; and `[zenoh.ros2]`: maps as ROS 2 topics.
 
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -20,6 +22,8 @@ pub struct Zenoh {
     pub listen: Vec<String>,
     /// Endpoints of routers or peers to connect to.
     pub connect: Vec<String>,
+    /// Most maps of a vehicle that are sent in a second, of all layers together; 0: all.
+    pub max_rate_hz: f64,
     /// True if peers are found by multicast.
     pub scouting: bool,
     /// The vehicles of other servers.
@@ -41,6 +45,7 @@ impl Default for Zenoh {
             mode: ZenohMode::Peer,
             listen: vec!["tcp/127.0.0.1:7447".into()],
             connect: Vec::new(),
+            max_rate_hz: 0.0,
             scouting: false,
             fleet: Fleet::default(),
             ros2: Ros2::default(),
@@ -62,9 +67,21 @@ impl Zenoh {
             let allowed = "with zenoh.mode = \"client\" the endpoint of a router, such as \"tcp/192.168.1.10:7447\"";
             return Err(ValueError::new("zenoh.connect", "[]", allowed));
         }
+        if self.max_rate_hz != 0.0 && !RATE_HZ.contains(&self.max_rate_hz) {
+            let allowed = format!("0 (all maps) or {} to {}", RATE_HZ.start(), RATE_HZ.end());
+            return Err(ValueError::new("zenoh.max_rate_hz", self.max_rate_hz, allowed));
+        }
         self.ros2.check(self.enabled, vehicles)
     }
+
+    /// Shortest time between two maps of a vehicle.
+    pub fn period(&self) -> Duration {
+        if self.max_rate_hz == 0.0 { Duration::ZERO } else { Duration::from_secs_f64(1.0 / self.max_rate_hz) }
+    }
 }
+
+/// The rates to which maps may be limited. Ours: no sensor makes more revolutions.
+const RATE_HZ: RangeInclusive<f64> = 0.01..=1000.0;
 
 /// Role in the zenoh network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

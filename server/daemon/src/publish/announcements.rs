@@ -10,12 +10,12 @@ use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::bytes::Encoding;
 use zenoh::pubsub::Subscriber;
-use zenoh::qos::{CongestionControl, Priority};
+use zenoh::qos::Priority;
 use zenoh::sample::Locality;
 
 use super::served::Vehicles;
 use crate::fleet::Fleet;
-use crate::zenoh_session::ZenohError;
+use crate::zenoh_session::{ZenohError, declare_publisher};
 
 /// Time between two announcements of a vehicle.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -35,9 +35,7 @@ pub(crate) async fn announce(
 ) -> Result<(), ZenohError> {
     for served in vehicles.0.iter() {
         let key = format!("clearway/@fleet/{:016x}/{}", served.status.boot_id, served.status.name);
-        let publisher = session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_PROTOBUF);
-        let publisher = publisher.congestion_control(CongestionControl::Drop).priority(Priority::DataLow);
-        let publisher = publisher.await.map_err(ZenohError::of(format!("publisher {key}")))?;
+        let publisher = declare_publisher(session, key, Encoding::APPLICATION_PROTOBUF, Priority::DataLow).await?;
         let (status, address, page) = (served.status.clone(), address.to_owned(), page.to_owned());
         tasks.spawn(async move {
             let mut every = tokio::time::interval(PERIOD);

@@ -9,7 +9,6 @@
 //! | [`listen`] | a TCP listener -> connections within their limits, requests of clients that may send them |
 //! | [`grpc`] | newest map -> gRPC streams, each with its layers, region, rate, deltas and credits |
 //! | `zenoh` | newest map -> one key for each layer, a status, a liveliness token |
-//! | `zenoh_pace` | probes of the link to the router -> when the next map may be sent |
 //! | `zenoh_recorder` | queries of operators -> the recorder |
 //! | `announcements` | own vehicles -> other servers; theirs -> the fleet |
 //! | `ros` | newest map -> ROS 2 topics in rmw_zenoh's key space |
@@ -35,8 +34,6 @@ mod ros;
 pub mod served;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
-#[cfg(feature = "zenoh")]
-mod zenoh_pace;
 #[cfg(feature = "zenoh")]
 pub(crate) mod zenoh_recorder;
 

@@ -11,8 +11,8 @@
 //!
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
 //!
-//! A server that is the client of a router sends a map when the link has transmitted the last (`zenoh_pace`), so that a
-//! thin link has fewer maps and not older ones; the maps between count as skipped.
+//! A server that is the client of a router has one map of a vehicle on the way at a time ([`Pace`]), so that a thin link
+//! has fewer maps and not older ones; the maps between count as skipped.
 //!
 //! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a
 //! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
@@ -23,8 +23,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use clearway_client::signature::SigningKey;
-use futures::StreamExt;
-use futures::stream::FuturesUnordered;
+use futures::future::{Fuse, FusedFuture, FutureExt};
 use serde_json::Value;
 use tokio::task::JoinSet;
 use zenoh::Session;
@@ -38,10 +37,9 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 
 use super::ros::Node;
 use super::served::{Served, Vehicles};
-use super::zenoh_pace::{Pace, Probe, Probes, REPEAT};
 use crate::config::{Zenoh as Options, ZenohMode, secret};
 use crate::status::{Reader, Transport, state_changed};
-use crate::zenoh_session::ZenohError;
+use crate::zenoh_session::{ZenohError, declare_publisher};
 use clearway_journal::encode::EncodedMap;
 
 /// Time between two status messages.
@@ -52,6 +50,9 @@ const STATUS_PERIOD: Duration = Duration::from_secs(1);
 const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Priority of maps: above zenoh's default (`Data`); `RealTime` is left for more urgent data of a vehicle.
 const MAPS: Priority = Priority::InteractiveHigh;
+/// Longest wait for the answer that a map has passed the link. Ours: longer than a link takes for a map that a planner
+/// can use. A full queue drops a query as it drops maps, and a router that denies it gets a map a second.
+const PASSED_MAX: Duration = Duration::from_secs(1);
 /// Priority of the status.
 const STATUS: Priority = Priority::DataLow;
 
@@ -61,9 +62,11 @@ pub struct Publisher {
     tokens: Vec<LivelinessToken>,
     tasks: JoinSet<()>,
     signing_key: Option<Arc<SigningKey>>,
-    /// True if all maps travel over one link, to a router. A server with several links is not paced by them, because a
-    /// peer that stops must not delay the others.
-    is_paced: bool,
+    /// True if all maps travel over one link, to a router. A server with several links does not wait for them, because
+    /// a peer that stops must not delay the others.
+    awaits_router: bool,
+    /// Shortest time between two maps of a vehicle.
+    period: Duration,
     /// Each vehicle with the publisher of its replay's end.
     replays: Vec<(Served, Arc<zenoh::pubsub::Publisher<'static>>)>,
 }
@@ -77,8 +80,9 @@ impl Publisher {
     pub async fn start(session: &Session, options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
         let signing_key = signing_key(&options.signing_key)?.map(Arc::new);
         let (tokens, tasks, replays) = (Vec::new(), JoinSet::new(), Vec::new());
-        let is_paced = options.mode == ZenohMode::Client;
-        let mut publisher = Self { session: session.clone(), tokens, tasks, signing_key, is_paced, replays };
+        let awaits_router = options.mode == ZenohMode::Client;
+        let (session, period) = (session.clone(), options.period());
+        let mut publisher = Self { session, tokens, tasks, signing_key, awaits_router, period, replays };
         for served in vehicles.0.iter() {
             publisher.publish(served).await?;
         }
@@ -137,22 +141,17 @@ impl Publisher {
             self.answer(served, layer, key).await?;
         }
         let key = format!("clearway/{vehicle}/status");
-        let status = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON);
-        let status = status.priority(STATUS);
-        let status = status
-            .congestion_control(CongestionControl::Drop)
-            .await
-            .map_err(ZenohError::of(format!("publisher {key}")))?;
+        let status = declare_publisher(&self.session, key, Encoding::APPLICATION_JSON, STATUS).await?;
         let token = self.session.liveliness().declare_token(format!("clearway/{vehicle}"));
         self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness clearway/{vehicle}")))?);
         let key = format!("clearway/{vehicle}/replay");
-        let replay = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON).priority(MAPS);
-        let replay = replay.congestion_control(CongestionControl::Drop).await;
-        let replay = Arc::new(replay.map_err(ZenohError::of(format!("publisher {key}")))?);
+        let replay = declare_publisher(&self.session, key.clone(), Encoding::APPLICATION_JSON, MAPS).await?;
+        let replay = Arc::new(replay);
         self.replays.push((served.clone(), replay.clone()));
         self.answer_replay(served, key).await?;
-        let probes = self.is_paced.then(|| Probes::new(&self.session, vehicle, MAPS));
-        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay, probes));
+        let link = self.awaits_router.then(|| (self.session.clone(), format!("clearway/{vehicle}/link")));
+        let pace = Pace { link, period: self.period };
+        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay, pace));
         self.watch_claims(served).await?;
         self.tasks.spawn({
             let served = served.clone();
@@ -272,25 +271,16 @@ async fn send_maps(
     publishers: Vec<(&'static str, String, Arc<AdvancedPublisher<'static>>)>,
     signing_key: Option<Arc<SigningKey>>,
     replay: Arc<zenoh::pubsub::Publisher<'static>>,
-    probes: Option<Probes>,
+    pace: Pace,
 ) {
-    let (mut pace, mut on_the_way) = (Pace::default(), FuturesUnordered::new());
+    let mut on_the_way = std::pin::pin!(Fuse::terminated());
     let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
     newest.mark_changed();
-    let (mut reported, mut last, mut is_silent) = (false, None, false);
+    let (mut reported, mut last, mut was_answered) = (false, None, true);
     loop {
-        let wait = pace.wait(Instant::now());
-        let was_silent = std::mem::replace(&mut is_silent, pace.is_silent(Instant::now()));
-        if is_silent && !was_silent {
-            let key = format!("clearway/{}/link", served.status.name);
-            tracing::warn!(
-                key,
-                "zenoh: maps are sent without pacing: the link is cut, or the router denies this query"
-            );
-        }
         tokio::select! {
             biased;
-            changed = newest.changed(), if wait == Some(Duration::ZERO) => {
+            changed = newest.changed(), if on_the_way.is_terminated() => {
                 if changed.is_err() {
                     break;
                 }
@@ -301,28 +291,20 @@ async fn send_maps(
                     let skipped = before.map_or(0, |(_, last)| map.sequence.saturating_sub(last + 1));
                     served.status.transports.skip_for_all(Transport::Zenoh, skipped);
                     let _hop = served.status.traces.hop(&map, "send", Some(Transport::Zenoh.as_str()));
-                    // Without a subscriber nothing travels.
-                    let probes = probes.as_ref().filter(|_| served.status.transports.count(Transport::Zenoh) > 0);
-                    let (at, before) = (Instant::now(), probe(probes).await);
+                    let began = Instant::now();
                     send_map(&map, &publishers, signing_key.as_deref()).await;
-                    if let (Some(before), Some(after)) = (before, probe(probes).await) {
-                        note_unanswered(&pace, &served);
-                        pace.sent(Instant::now());
-                        on_the_way.push(passed(pace.count(), Some((at, before)), after));
+                    // Without a subscriber nothing travels.
+                    if served.status.transports.count(Transport::Zenoh) > 0 {
+                        on_the_way.set(pace.passed(began).fuse());
                     }
                 }
             }
-            Some(passed) = on_the_way.next() => {
-                if let Some(Passed { count, transmission, took }) = passed {
-                    pace.arrived(Instant::now(), count, transmission);
-                    took.into_iter().for_each(|took| served.status.network.note_link(Instant::now(), took));
+            is_answered = &mut on_the_way, if !on_the_way.is_terminated() => {
+                if was_answered && !is_answered {
+                    let vehicle = &*served.status.name;
+                    tracing::warn!(vehicle, "zenoh: a map a second is sent: the link is cut, or the router denies the query of clearway/{vehicle}/link");
                 }
-            }
-            () = tokio::time::sleep(wait.unwrap_or(REPEAT)), if wait != Some(Duration::ZERO) => {
-                if let (None, Some(again)) = (wait, probe(probes.as_ref()).await) {
-                    note_unanswered(&pace, &served);
-                    on_the_way.push(passed(pace.count(), None, again));
-                }
+                was_answered = is_answered;
             }
             Ok(()) = replay_ended.changed() => {}
         }
@@ -336,46 +318,31 @@ async fn send_maps(
     std::future::pending::<()>().await;
 }
 
-/// Maps that have passed the link.
-struct Passed {
-    /// The first maps, by their number.
-    count: u64,
-    /// Time that the link took for the last of them alone, if that is known.
-    transmission: Option<Duration>,
-    /// The same with the time in the queue of the link, from when it was sent.
-    took: Option<Duration>,
+/// When the next map of a vehicle may be sent.
+struct Pace {
+    /// The session with the router, and a key without a queryable there; `None`: maps do not wait for the link.
+    link: Option<(Session, String)>,
+    /// Shortest time between two maps.
+    period: Duration,
 }
 
-/// Waits until the first `count` maps have passed the link, by the probes before and after the last of them; the first
-/// was sent at this time. `None` if a probe is not answered.
-async fn passed(count: u64, before: Option<(Instant, Probe)>, after: Probe) -> Option<Passed> {
-    let before = match before {
-        Some((at, before)) => Some((at, before.answered().await?)),
-        None => None,
-    };
-    let after = after.answered().await?;
-    let transmission = before.map(|(_, before)| after.duration_since(before));
-    Some(Passed { count, transmission, took: before.map(|(at, _)| after.duration_since(at)) })
-}
-
-/// Notes how long the link has taken until now for the map on the way, if that is more than the last one took.
-fn note_unanswered(pace: &Pace, served: &Served) {
-    let (now, network) = (Instant::now(), &served.status.network);
-    if let Some(unanswered) = pace.unanswered(now)
-        && network.link(now).is_none_or(|took| took < unanswered)
-    {
-        network.note_link(now, unanswered);
-    }
-}
-
-/// Sends a probe of the link, if maps are paced by it.
-async fn probe(probes: Option<&Probes>) -> Option<Probe> {
-    match probes?.send().await {
-        Ok(probe) => Some(probe),
-        Err(error) => {
-            tracing::warn!(%error, "zenoh: maps are sent without pacing");
-            None
-        }
+impl Pace {
+    /// Waits until the map that was sent from `began` on has passed the link, and the next is due. Returns false if the
+    /// router has not answered in time.
+    async fn passed(&self, began: Instant) -> bool {
+        let answered = async {
+            let Some((session, key)) = &self.link else { return true };
+            // The router ends this query at once. It travels behind the map; express, because in one batch with the map
+            // it would arrive together with it.
+            let query = session.get(key).allowed_destination(Locality::Remote).timeout(PASSED_MAX).express(true);
+            let answers = query.priority(MAPS).congestion_control(CongestionControl::Drop).await;
+            // A reply says that the time is over.
+            match answers {
+                Ok(answers) => answers.recv_async().await.is_err(),
+                Err(_) => false,
+            }
+        };
+        tokio::join!(answered, tokio::time::sleep_until((began + self.period).into())).0
     }
 }
 

@@ -239,11 +239,7 @@ impl Running {
             if options.awaits_store {
                 let saved = Duration::from_secs(config.recorder.save_s);
                 let (control, counts) = (recorder.control(), recorder.counts());
-                let validity = |vehicle: &Vehicle| Duration::from_millis(vehicle.maps.valid_ms.into());
-                let valid = config.vehicles.iter().map(validity).collect();
-                let rate = uploads::rate(&config.store, &self.vehicles, valid);
-                let store = (config.store.clone(), rate);
-                let uploads = uploads::upload_finished(store, saved, control.clone(), counts);
+                let uploads = uploads::upload_finished(config.store.clone(), saved, control.clone(), counts);
                 let (stopped, runtime) = (self.stopped(), tokio::runtime::Handle::current());
                 // What the store has not confirmed at the end stays, and the next start sends it. On a thread of its
                 // own, because it reads whole files.

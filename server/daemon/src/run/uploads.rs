@@ -9,11 +9,10 @@ use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt};
 
 use crate::config::Store;
-use crate::publish::Vehicles;
 use crate::record::writer::{RecorderControl, RecorderCounts};
 use crate::store::location;
-use crate::store::rate::UploadRate;
 use crate::store::upload::{self, Prepared, UploadError};
+use crate::store::upload_limit::UploadLimit;
 
 /// Time between two looks for finished parts, and the first between two attempts with a store that is away; each
 /// further one is twice as long. Ours: a part is minutes long.
@@ -24,10 +23,6 @@ const PERIOD_MAX: Duration = Duration::from_secs(60);
 /// Longest time until the store answers whether it has a part. Ours: a part itself may take a minute on a thin link,
 /// and a store that hangs is to be named before.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
-
-/// Share of its validity that counts as what the link takes for a map while no router is connected. Ours: uploads get
-/// faster slowly, because their path may be another one.
-const AWAY_SHARE: f64 = 0.4;
 
 /// A file as it was when it was read: path, length, time of the newest change.
 type Seen = (PathBuf, u64, SystemTime);
@@ -48,7 +43,7 @@ struct Uploads {
     control: RecorderControl,
     counts: Arc<RecorderCounts>,
     store: Option<Arc<dyn ObjectStore>>,
-    rate: UploadRate,
+    limit: Option<UploadLimit>,
     answer_timeout: Duration,
     /// Parts that the store has confirmed, and those without an event or a map.
     settled: BTreeSet<Seen>,
@@ -56,32 +51,15 @@ struct Uploads {
     prepared: BTreeMap<Seen, Prepared>,
 }
 
-/// A rate of uploads that gives way to the maps of these vehicles, with the validity of each, on the link to the zenoh
-/// router.
-pub(super) fn rate(options: &Store, vehicles: &Vehicles, valid: Vec<Duration>) -> UploadRate {
-    let vehicles = vehicles.clone();
-    let share = move || {
-        let now = Instant::now();
-        let networks = vehicles.0.iter().map(|served| &served.status.network);
-        let shares = networks.zip(&valid).filter_map(|(network, valid)| {
-            let took = network.link(now).map(|took| took.div_duration_f64(*valid));
-            // A link that is cut: what is written to it now waits in front of the next maps.
-            took.or(network.is_away().then_some(AWAY_SHARE))
-        });
-        shares.reduce(f64::max)
-    };
-    UploadRate::new(options.upload_kbit_s_max, Arc::new(share))
-}
-
-/// Sends each finished part to the store, at this rate, until the task is aborted. What the store does not confirm
+/// Sends each finished part to the store until the task is aborted. What the store does not confirm
 /// stays, and is sent again. With `delete`, what it confirms is deleted once it is older than `saved`.
 pub(super) async fn upload_finished(
-    (options, rate): (Store, UploadRate),
+    options: Store,
     saved: Duration,
     control: RecorderControl,
     counts: Arc<RecorderCounts>,
 ) {
-    let mut uploads = Uploads { rate, ..Uploads::new(options, saved, control, counts) };
+    let mut uploads = Uploads::new(options, saved, control, counts);
     let mut period = PERIOD;
     loop {
         let problem = uploads.upload_all().await.err();
@@ -123,8 +101,8 @@ fn period_after(period: Duration, problem: Option<&Problem>) -> Duration {
 impl Uploads {
     fn new(options: Store, saved: Duration, control: RecorderControl, counts: Arc<RecorderCounts>) -> Self {
         let (store, settled, prepared) = (None, BTreeSet::new(), BTreeMap::new());
-        let (rate, answer_timeout) = (UploadRate::unlimited(), ANSWER_TIMEOUT);
-        Self { options, saved, control, counts, store, rate, answer_timeout, settled, prepared }
+        let (limit, answer_timeout) = (UploadLimit::new(options.upload_kbit_s_max), ANSWER_TIMEOUT);
+        Self { options, saved, control, counts, store, limit, answer_timeout, settled, prepared }
     }
 
     /// Sends the parts that wait, up to the first that the store refuses.
@@ -210,7 +188,8 @@ impl Uploads {
         let store = match &self.store {
             Some(store) => store.clone(),
             None => {
-                location::open_at(&self.options.url, &self.rate).map_err(|error| Problem::Store(error.to_string()))?
+                let opened = location::open_limited(&self.options.url, self.limit.as_ref());
+                opened.map_err(|error| Problem::Store(error.to_string()))?
             }
         };
         self.store = Some(store.clone());
@@ -220,7 +199,7 @@ impl Uploads {
             let reason = format!("{} has not answered for {:?}", self.options.url, self.answer_timeout);
             return Err(Problem::Store(reason));
         }
-        let uploaded = upload::upload_prepared(&*store, part, &self.prepared[seen], &self.rate).await;
+        let uploaded = upload::upload_prepared(&*store, part, &self.prepared[seen], self.limit.as_ref()).await;
         uploaded.map_err(|error| match error {
             UploadError::Store { .. } | UploadError::Differs { .. } => Problem::Store(error.to_string()),
             error => of_part(error),

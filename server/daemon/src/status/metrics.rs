@@ -5,7 +5,6 @@ use std::fmt;
 use std::fs;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Instant;
 
 use clearway_mapping::pipeline::NamedStatus;
 use clearway_mapping::sensor::mount::check::MountDeviation;
@@ -235,11 +234,7 @@ impl Families<'_, '_> {
         let skips = of_all(|of, transport| of.status.transports.skips(transport) as f64);
         self.family("clearway_readers", "Readers of the vehicle's maps.", readers)?;
         let help = "Maps that readers did not get because they or their links were late.";
-        self.family("clearway_skipped_maps_total", help, skips)?;
-        let help = "Time that the link to the zenoh router took for the newest map.";
-        self.each_vehicle("clearway_map_link_seconds", help, |of| {
-            Some(of.status.network.link(Instant::now())?.as_secs_f64())
-        })
+        self.family("clearway_skipped_maps_total", help, skips)
     }
 
     fn write_recorder(&mut self) -> fmt::Result {

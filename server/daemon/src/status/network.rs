@@ -1,5 +1,5 @@
-//! What a server knows of its network: listeners that hang, the router it has no session with, certificates that end, a
-//! configuration that was not read again, and what the link to the router takes for a map.
+//! What a server knows of its network: listeners that hang, the router it has no session with, certificates that end, and
+//! a configuration that was not read again.
 
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
@@ -11,8 +11,6 @@ use crate::base::sync::locked;
 const AWAY_NAMED_AFTER: Duration = Duration::from_secs(2);
 /// Time before the end of a certificate at which that is named. Ours: a week to write a new one.
 const END_NAMED_BEFORE: Duration = Duration::from_secs(7 * 24 * 3600);
-/// Age after which what the link took for a map says nothing about now. Ours: ten maps.
-const LINK_AGE_MAX: Duration = Duration::from_secs(1);
 
 /// The zenoh routers of which none is connected.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -46,8 +44,6 @@ pub struct Network {
     certificates: Mutex<Vec<(&'static str, i64)>>,
     /// Why the configuration was not read again at the newest SIGHUP; `None` if it was, or there was none.
     refused_reload: Mutex<Option<String>>,
-    /// Time that the link to the router took for the newest map that is known of, and when that was known.
-    link: Mutex<Option<(Instant, Duration)>>,
 }
 
 impl Network {
@@ -71,11 +67,6 @@ impl Network {
         *locked(&self.undelivered) = undelivered;
     }
 
-    /// True if no router is connected, though one is configured.
-    pub fn is_away(&self) -> bool {
-        locked(&self.router).is_some()
-    }
-
     /// Notes when the certificates end, by their keys in the configuration, in seconds since the Unix epoch.
     pub fn set_certificates(&self, ends: &[(&'static str, i64)]) {
         ends.clone_into(&mut locked(&self.certificates));
@@ -89,18 +80,6 @@ impl Network {
     /// True if the configuration was read again at the newest SIGHUP, or there was none.
     pub fn is_reloaded(&self) -> bool {
         locked(&self.refused_reload).is_none()
-    }
-
-    /// Notes how long the link to the router took for a map, from when it was sent until it was transmitted; or how
-    /// long it has taken until now.
-    pub fn note_link(&self, now: Instant, took: Duration) {
-        *locked(&self.link) = Some((now, took));
-    }
-
-    /// What the link to the router takes for a map; `None` while no map is sent or it is not measured.
-    pub fn link(&self, now: Instant) -> Option<Duration> {
-        let newest = *locked(&self.link);
-        newest.filter(|(at, _)| now.saturating_duration_since(*at) < LINK_AGE_MAX).map(|(_, took)| took)
     }
 
     /// What is wrong, in words, at this time of both clocks (nanoseconds since the Unix epoch), though maps are made.
@@ -210,14 +189,5 @@ mod tests {
         assert_eq!((network.problems(now, 0), network.is_reloaded()), (vec![text.to_owned()], false));
         network.set_refused_reload(None);
         assert_eq!((network.problems(now, 0), network.is_reloaded()), (vec![], true));
-    }
-
-    #[test]
-    fn what_the_link_took_for_a_map_is_known_for_a_second() {
-        let (network, start) = (Network::default(), Instant::now());
-        assert_eq!(network.link(start), None);
-        network.note_link(start, Duration::from_millis(70));
-        assert_eq!(network.link(start + Duration::from_millis(900)), Some(Duration::from_millis(70)));
-        assert_eq!(network.link(start + Duration::from_millis(1000)), None);
     }
 }

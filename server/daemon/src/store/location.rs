@@ -9,12 +9,12 @@ use object_store::local::LocalFileSystem;
 use object_store::prefix::PrefixStore;
 use object_store::{ClientOptions, ObjectStore, RetryConfig};
 
-use super::paced_http::{PacedConnector, SILENT_MAX};
-use super::rate::UploadRate;
+use super::upload_limit::UploadLimit;
 use crate::base::file_advice::advised;
 
-/// Longest time of one request without a rate.
-const REQUEST_TIMEOUT: Duration = SILENT_MAX;
+/// Longest time of one request without a limit of uploads. Ours: a piece of a part (5 MiB) arrives in this time at 400
+/// kbit/s.
+pub(super) const REQUEST_TIMEOUT: Duration = Duration::from_secs(105);
 /// Longest time in which a request is repeated. Ours; after it the part waits until the folder is looked at again.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -36,24 +36,19 @@ pub struct OpenError {
 /// [`OpenError`] for another kind of URL, a folder that cannot be created, or variables that contradict each other. A
 /// server that does not answer is no error here.
 pub fn open(url: &str) -> Result<Arc<dyn ObjectStore>, OpenError> {
-    create(url)?;
-    open_existing(url)
+    open_limited(url, None)
 }
 
-/// As [`open`]; what is sent to a bucket is sent at this rate. A request of it may take as long as it sends something.
+/// As [`open`]; what is sent to a bucket has this limit.
 ///
 /// # Errors
 /// As [`open`].
-pub fn open_at(url: &str, rate: &UploadRate) -> Result<Arc<dyn ObjectStore>, OpenError> {
-    create(url)?;
-    opened(url, |builder| builder.with_http_connector(PacedConnector(rate.clone())))
-}
-
-/// Creates the folder that a URL names.
-fn create(url: &str) -> Result<(), OpenError> {
-    let Some(folder) = folder(url) else { return Ok(()) };
-    let wrong = |source| OpenError { url: url.to_owned(), reason: advised(folder, source).to_string() };
-    std::fs::create_dir_all(folder).map_err(wrong)
+pub fn open_limited(url: &str, limit: Option<&UploadLimit>) -> Result<Arc<dyn ObjectStore>, OpenError> {
+    if let Some(folder) = folder(url) {
+        let wrong = |source| OpenError { url: url.to_owned(), reason: advised(folder, source).to_string() };
+        std::fs::create_dir_all(folder).map_err(wrong)?;
+    }
+    opened(url, limit)
 }
 
 /// The folder that a text names by its path or as `file:///PATH`; `None` for other URLs.
@@ -70,13 +65,10 @@ pub fn folder(url: &str) -> Option<&Path> {
 /// # Errors
 /// As [`open`], and for a folder that does not exist.
 pub fn open_existing(url: &str) -> Result<Arc<dyn ObjectStore>, OpenError> {
-    opened(url, |builder| builder.with_client_options(client_options().with_timeout(REQUEST_TIMEOUT)))
+    opened(url, None)
 }
 
-fn opened(
-    url: &str,
-    connect: impl FnOnce(AmazonS3Builder) -> AmazonS3Builder,
-) -> Result<Arc<dyn ObjectStore>, OpenError> {
+fn opened(url: &str, limit: Option<&UploadLimit>) -> Result<Arc<dyn ObjectStore>, OpenError> {
     let wrong = |reason: String| OpenError { url: url.to_owned(), reason };
     if let Some(folder) = folder(url) {
         if !folder.is_dir() {
@@ -95,12 +87,15 @@ fn opened(
     // Another part of this process may have set the provider already; both are ring.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let retry = RetryConfig { retry_timeout: RETRY_TIMEOUT, ..RetryConfig::default() };
-    let store = AmazonS3Builder::from_env()
+    let mut store = AmazonS3Builder::from_env()
         .with_bucket_name(bucket)
         .with_checksum_algorithm(Checksum::SHA256)
         .with_client_options(client_options())
         .with_retry(retry);
-    let store = connect(store).build().map_err(|error| wrong(error.to_string()))?;
+    if let Some(limit) = limit {
+        store = store.with_http_connector(limit.clone());
+    }
+    let store = store.build().map_err(|error| wrong(error.to_string()))?;
     Ok(match prefix.trim_matches('/') {
         "" => Arc::new(store),
         prefix => Arc::new(PrefixStore::new(store, prefix)),
@@ -111,5 +106,5 @@ fn opened(
 fn client_options() -> ClientOptions {
     let is_http = |name| std::env::var(name).is_ok_and(|url| url.starts_with("http://"));
     let allows_http = ["AWS_ENDPOINT_URL", "AWS_ENDPOINT", "AWS_ENDPOINT_URL_S3"].into_iter().any(is_http);
-    ClientOptions::new().with_allow_http(allows_http)
+    ClientOptions::new().with_allow_http(allows_http).with_timeout(REQUEST_TIMEOUT)
 }

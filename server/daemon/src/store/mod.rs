@@ -4,10 +4,9 @@
 //! |---|---|
 //! | [`location`] | a path or a URL -> the store |
 //! | [`index`] | a finished part -> what it holds, for a search; a search -> the parts |
-//! | [`rate`] | what the link takes for maps -> how fast uploads may be |
-//! | [`paced_http`] | requests to a store -> the same at that rate |
 //! | [`fetch`] | the URL of a recording in a store -> a copy here |
 //! | [`upload`] | finished parts of a folder -> the store, confirmed |
+//! | [`upload_limit`] | requests to a bucket -> the same within a limit of the configuration |
 //!
 //! A part is the object `parts/<time>-<CRC>.mcap`; what it holds is the object `index/<vehicle>/<time>-<CRC>.json`,
 //! one for each vehicle. The time is that of the first message, in ns, in 20 digits, so that names sort by time.
@@ -15,6 +14,5 @@
 pub mod fetch;
 pub mod index;
 pub mod location;
-pub mod paced_http;
-pub mod rate;
 pub mod upload;
+pub mod upload_limit;

@@ -13,14 +13,13 @@ use object_store::{ObjectStore, ObjectStoreExt, WriteMultipart, path::Path as Ke
 use serde::{Deserialize, Serialize};
 
 use super::index::Entry;
-use super::rate::UploadRate;
+use super::upload_limit::UploadLimit;
 use crate::record::writer::{confirmation_of, is_being_written};
 use clearway_journal::mcap_reader::McapReadError;
 
-/// Bytes of one piece of a part, which is sent at once. S3 allows 5 MiB or more.
-const PIECE_BYTES: usize = 8 << 20;
-/// Pieces that are sent at the same time.
-const PIECES: usize = 2;
+/// Bytes of one piece of a part, in one request, one request at a time; and most that are read back at once. S3 allows
+/// 5 MiB or more.
+const PIECE_BYTES: usize = 5 << 20;
 /// Age after which a file without closing records is no longer being written. Ours: a program that copies a file writes
 /// each second.
 const STILL_WRITTEN: Duration = Duration::from_secs(60);
@@ -108,7 +107,7 @@ pub fn reason(error: &object_store::Error) -> String {
 /// # Errors
 /// [`UploadError`]; the part is then not confirmed.
 pub async fn upload(store: &dyn ObjectStore, finished_part: &Path) -> Result<Confirmation, UploadError> {
-    upload_prepared(store, finished_part, &prepare(finished_part)?, &UploadRate::unlimited()).await
+    upload_prepared(store, finished_part, &prepare(finished_part)?, None).await
 }
 
 /// Reads a finished part for [`upload_prepared`].
@@ -124,7 +123,7 @@ pub fn prepare(file: &Path) -> Result<Prepared, UploadError> {
     Ok(Prepared { bytes, crc32, entries })
 }
 
-/// As [`upload`], for a part that was prepared and has not changed since, and is read back at this rate.
+/// As [`upload`], for a part that was prepared and has not changed since, and is read back within the limit.
 ///
 /// # Errors
 /// As [`upload`].
@@ -132,7 +131,7 @@ pub async fn upload_prepared(
     store: &dyn ObjectStore,
     file: &Path,
     prepared: &Prepared,
-    rate: &UploadRate,
+    limit: Option<&UploadLimit>,
 ) -> Result<Confirmation, UploadError> {
     let read = |source| UploadError::Read { file: file.to_owned(), source };
     let refused = |source| UploadError::Store { file: file.to_owned(), source };
@@ -140,7 +139,7 @@ pub async fn upload_prepared(
     let (bytes, crc32, part) = (*bytes, *crc32, entries[0].part.clone());
     let key = Key::from(part.as_str());
     send(store, &key, file).await?;
-    let found = crc_in_store(store, &key, rate).await.map_err(refused)?;
+    let found = crc_in_store(store, &key, limit).await.map_err(refused)?;
     if found != (bytes, crc32) {
         return Err(UploadError::Differs { file: file.to_owned(), part, sent: crc32, found: found.1 });
     }
@@ -221,20 +220,26 @@ async fn send(store: &dyn ObjectStore, key: &Key, file: &Path) -> Result<(), Upl
         if piece.is_empty() {
             break;
         }
-        pieces.wait_for_capacity(PIECES).await.map_err(refused)?;
+        pieces.wait_for_capacity(1).await.map_err(refused)?;
         pieces.put(piece.into());
     }
     pieces.finish().await.map(drop).map_err(refused)
 }
 
-/// The length and the CRC-32 of an object. It is read in ranges, because what the store has begun to send cannot be
-/// held back.
-async fn crc_in_store(store: &dyn ObjectStore, key: &Key, rate: &UploadRate) -> object_store::Result<(u64, u32)> {
+/// The length and the CRC-32 of an object, which is read in ranges.
+async fn crc_in_store(
+    store: &dyn ObjectStore,
+    key: &Key,
+    limit: Option<&UploadLimit>,
+) -> object_store::Result<(u64, u32)> {
     let length = store.head(key).await?.size;
+    let most = limit.map_or(PIECE_BYTES as u64, UploadLimit::answer_bytes);
     let (mut read, mut crc) = (0, crc32fast::Hasher::new());
     while read < length {
-        let range = read..length.min(read + rate.answer_bytes() as u64);
-        rate.take((range.end - range.start) as usize).await;
+        let range = read..length.min(read + most);
+        if let Some(limit) = limit {
+            limit.take(range.end - range.start).await;
+        }
         read = range.end;
         crc.update(&store.get_range(key, range).await?);
     }

@@ -23,6 +23,8 @@ const OTHER: &str = "v01";
 const LAYER: &str = "speed";
 const S3: &str = "10.99.0.31:9000";
 const STORE: &str = "s3://fleet/kept";
+/// What uploads of recordings may send.
+const UPLOAD_KBIT_S: u32 = 500;
 /// Longest wait for fresh maps, and for the store to have every part.
 const PATIENCE: Duration = Duration::from_secs(90);
 /// Time for which servers and readers have started before anything is measured.
@@ -115,6 +117,7 @@ impl Bed {
             config.recorder.file = self.recording().join("car.mcap");
             (config.recorder.part_s, config.recorder.save_s, config.recorder.warm_up_ms) = (2, 1, 500);
             (config.store.url, config.store.delete) = (STORE.into(), true);
+            config.store.upload_kbit_s_max = UPLOAD_KBIT_S;
         }
         self.machines.start_server(machine, "", &config, recording);
     }
@@ -198,6 +201,8 @@ impl Bed {
         let keys = [("AWS_ACCESS_KEY_ID", "test"), ("AWS_SECRET_ACCESS_KEY", "test"), ("AWS_REGION", "us-east-1")];
         let variables = [&[("AWS_ENDPOINT_URL", &*url)][..], &keys].concat();
         self.start_server("s1", VEHICLE, &variables);
+        // Scans of a plain, which compress: a recording within the limit of uploads.
+        self.machines.start_role("s1 feed", "s1", "", &["feed", VEHICLE]);
         let thin = Phase { kbit_s: 1000, what: "with the recording", readers: &["p1"] };
         if !self.measure(&Phase { kbit_s: 0, ..thin }, length) {
             return false;
