@@ -92,18 +92,6 @@ pub fn settings<'a>(
     Ok(config)
 }
 
-/// The settings of a second session beside that of the server, which only reads; `None` if the file of `[zenoh]` has
-/// the id of the session, because two sessions with one id are refused.
-///
-/// # Errors
-/// [`ZenohError`] as for [`settings`].
-pub(crate) fn reader_settings(options: &Options) -> Result<Option<Config>, ZenohError> {
-    let mut config = session_config(options, MESSAGE_BYTES_MAX)?;
-    config.insert_json5("listen/endpoints", "[]").map_err(ZenohError::of("listen/endpoints"))?;
-    let has_id = config.get_json("id").is_ok_and(|id| id != "null");
-    Ok((!has_id).then_some(config))
-}
-
 /// Opens the session.
 ///
 /// # Errors

@@ -11,16 +11,10 @@
 //! | `save_rules` | stale maps and lost sensors -> saves of the recording |
 //! | `uploads` | finished parts of the recording -> the store |
 //! | `over_zenoh` | everything that uses the zenoh session |
-//! | `opening` | a router that answers, at the start or later -> the session |
-//! | `delivery` | whether the router delivers what this server publishes -> status and log |
-//! | `router` | whether a router is connected -> status and log |
+//! | `router` | a router that answers later than at the start -> the session; whether one is connected -> status, log |
 
-#[cfg(feature = "zenoh")]
-mod delivery;
 mod input;
 mod listeners;
-#[cfg(feature = "zenoh")]
-mod opening;
 #[cfg(feature = "zenoh")]
 mod over_zenoh;
 #[cfg(feature = "zenoh")]

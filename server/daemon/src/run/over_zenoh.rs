@@ -6,8 +6,6 @@ use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::pubsub::Subscriber;
 
-use super::delivery::watch_delivery;
-use super::router::watch_router;
 use crate::config::{Config, ZenohMode};
 use crate::fleet::Fleet;
 use crate::ingest::gateway::Gateways;
@@ -41,7 +39,7 @@ pub(super) struct OverZenoh {
     /// One task a vehicle.
     ingest: JoinSet<()>,
     ros: Vec<LiveTopics>,
-    /// One task a vehicle, and two that watch the router.
+    /// One task a vehicle.
     announcements: JoinSet<()>,
     /// One task a vehicle.
     recorder: JoinSet<()>,
@@ -61,13 +59,6 @@ impl OverZenoh {
         if config.zenoh.fleet.announce {
             let address = grpc.and_then(|bound| config.grpc.advertised(bound)).unwrap_or_default();
             announcements::announce(&session, vehicles, (&address, &config.page.advertise), &mut announcements).await?;
-        }
-        if config.zenoh.mode == ZenohMode::Client {
-            announcements.spawn(watch_router(session.clone(), config.zenoh.connect.clone(), vehicles.clone()));
-            if let Some(reader) = zenoh_session::reader_settings(&config.zenoh)? {
-                let watch = watch_delivery(session.clone(), reader, config.zenoh.clone(), vehicles.clone());
-                announcements.spawn(watch);
-            }
         }
         let others = match config.zenoh.fleet.list {
             true => Some(announcements::hear(&session, fleet.clone()).await?),
@@ -104,6 +95,11 @@ impl OverZenoh {
                 .await?;
         }
         Ok(())
+    }
+
+    /// True if the session is connected to a router.
+    pub(super) async fn has_router(&self) -> bool {
+        self.session.info().routers_zid().await.next().is_some()
     }
 
     /// The endpoints the session listens on.

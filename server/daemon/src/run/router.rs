@@ -1,70 +1,91 @@
-//! Whether a router is connected to a server that is the client of one, in the status and the log; and why none is.
+//! The zenoh session of a server that is the client of a router: opened once a router answers, while serving goes on;
+//! and in the status and the log whether a router is connected, and why none is.
 
 use std::net::ToSocketAddrs;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio::net::TcpStream;
-use zenoh::Session;
+use tokio::sync::Mutex;
 
+use super::over_zenoh::{OverZenoh, Users};
 use crate::publish::Vehicles;
+use crate::record::writer::RecorderControl;
 use crate::status::network::Away;
+use crate::zenoh_session;
 
-/// Time between two looks for a router.
-pub(super) const PERIOD: Duration = Duration::from_millis(500);
+/// Time between two attempts to open the session, and between two looks for its router.
+const PERIOD: Duration = Duration::from_millis(500);
 /// Time between two questions why no router is connected, and the longest time of one.
 const ASK_PERIOD: Duration = Duration::from_secs(5);
 const ASK_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Notes in the status of the vehicles while no router is connected.
-pub(super) async fn watch_router(session: Session, endpoints: Vec<String>, vehicles: Vehicles) {
-    let mut away = Watch::new(endpoints, vehicles);
+/// What uses the session, once there is one.
+pub(super) type Connected = Arc<Mutex<Option<OverZenoh>>>;
+
+/// Opens the session as soon as a router answers, and starts what uses it.
+pub(super) async fn connect(
+    settings: zenoh::Config,
+    users: Users,
+    control: Option<RecorderControl>,
+    connected: Connected,
+) {
+    let session = loop {
+        match zenoh_session::open(settings.clone(), &users.config.zenoh).await {
+            Ok(session) => break session,
+            Err(error) => tracing::debug!(%error, "no session"),
+        }
+        tokio::time::sleep(PERIOD).await;
+    };
+    let started = async {
+        let mut over_zenoh = OverZenoh::start(session, &users).await?;
+        over_zenoh.serve_recorder(&users.config, control.as_ref()).await?;
+        Ok::<_, zenoh_session::ZenohError>(over_zenoh)
+    };
+    match started.await {
+        Ok(over_zenoh) => *connected.lock().await = Some(over_zenoh),
+        Err(error) => tracing::error!(%error, "no maps over zenoh"),
+    }
+}
+
+/// Notes in the status of the vehicles while no router is connected, and why.
+pub(super) async fn watch(connected: Connected, endpoints: Vec<String>, vehicles: Vehicles) {
+    let (mut away, mut asked) = (None::<Away>, None::<Instant>);
     let mut every = tokio::time::interval(PERIOD);
+    let all = endpoints.join(", ");
     loop {
         every.tick().await;
-        away.note(session.info().routers_zid().await.next().is_some()).await;
-    }
-}
-
-/// Since when no router is connected, and why.
-pub(super) struct Watch {
-    endpoints: Vec<String>,
-    vehicles: Vehicles,
-    away: Option<Away>,
-    asked: Option<Instant>,
-}
-
-impl Watch {
-    pub(super) fn new(endpoints: Vec<String>, vehicles: Vehicles) -> Self {
-        Self { endpoints, vehicles, away: None, asked: None }
-    }
-
-    /// Notes whether a router is connected now.
-    pub(super) async fn note(&mut self, is_connected: bool) {
-        let endpoints = self.endpoints.join(", ");
-        match (is_connected, &mut self.away) {
-            (true, None) => return,
-            (true, Some(away)) => {
-                let seconds = away.since.elapsed().as_secs_f64();
-                if !away.reason.is_empty() {
-                    tracing::info!(endpoints, "zenoh: a router is connected, after {seconds:.1} s without one");
+        let has_router = match &*connected.lock().await {
+            Some(over_zenoh) => over_zenoh.has_router().await,
+            None => false,
+        };
+        match (has_router, &mut away) {
+            (true, None) => continue,
+            (true, Some(was_away)) => {
+                let seconds = was_away.since.elapsed().as_secs_f64();
+                if !was_away.reason.is_empty() {
+                    tracing::info!(endpoints = all, "zenoh: a router is connected, after {seconds:.1} s without one");
                 }
-                (self.away, self.asked) = (None, None);
+                (away, asked) = (None, None);
             }
             (false, None) => {
-                self.away = Some(Away { since: Instant::now(), endpoints, reason: String::new() });
+                away = Some(Away { since: Instant::now(), endpoints: all.clone(), reason: String::new() });
             }
-            (false, Some(away)) => {
-                if self.asked.is_none_or(|asked| asked.elapsed() >= ASK_PERIOD) {
-                    self.asked = Some(Instant::now());
-                    let reason = why(&self.endpoints).await;
-                    if reason != away.reason {
-                        tracing::warn!(endpoints, reason, "zenoh: no router is connected; serving goes on without it");
-                        away.reason = reason;
-                    }
+            (false, Some(away)) if asked.is_none_or(|asked| asked.elapsed() >= ASK_PERIOD) => {
+                asked = Some(Instant::now());
+                let reason = why(&endpoints).await;
+                if reason != away.reason {
+                    tracing::warn!(
+                        endpoints = all,
+                        reason,
+                        "zenoh: no router is connected; serving goes on without it"
+                    );
+                    away.reason = reason;
                 }
             }
+            (false, Some(_)) => continue,
         }
-        self.vehicles.0.iter().for_each(|served| served.status.network.set_away(self.away.clone()));
+        vehicles.0.iter().for_each(|served| served.status.network.set_away(away.clone()));
     }
 }
 

@@ -68,8 +68,8 @@ pub struct Running {
     pub(super) listeners: Option<(Security, Vec<(&'static str, ListenerHandle)>)>,
     pub(super) traces: Traces,
     #[cfg(feature = "zenoh")]
-    pub(super) connected: super::opening::Connected,
-    /// Waits for the router.
+    pub(super) connected: super::router::Connected,
+    /// Waits for the router, and watches it.
     #[cfg(feature = "zenoh")]
     pub(super) connecting: JoinSet<()>,
 }
@@ -162,7 +162,7 @@ impl Running {
         #[cfg(feature = "zenoh")]
         {
             self.connecting.shutdown().await;
-            if let Some(over_zenoh) = &mut *self.connected.0.lock().await {
+            if let Some(over_zenoh) = &mut *self.connected.lock().await {
                 over_zenoh.stop_ros().await;
             }
         }
@@ -188,7 +188,7 @@ impl Running {
             publishers.shutdown().await;
         }
         #[cfg(feature = "zenoh")]
-        if let Some(over_zenoh) = self.connected.0.lock().await.take()
+        if let Some(over_zenoh) = self.connected.lock().await.take()
             && tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, over_zenoh.stop()).await.is_err()
         {
             tracing::warn!("zenoh did not close in time");

@@ -16,9 +16,9 @@ use tokio::sync::watch;
 use super::input::VehicleInput;
 use super::listeners::Listeners;
 #[cfg(feature = "zenoh")]
-use super::opening::Opening;
-#[cfg(feature = "zenoh")]
 use super::over_zenoh::{OverZenoh, Users};
+#[cfg(feature = "zenoh")]
+use super::router;
 use super::running::Running;
 use super::save_rules;
 use super::setup::{Setup, StartError};
@@ -158,20 +158,20 @@ impl Running {
         drop(held);
         let gateways = self.gateways(config);
         #[cfg(feature = "zenoh")]
-        let mut opening = None;
+        let mut unconnected = None;
         #[cfg(feature = "zenoh")]
         if config.zenoh.enabled {
-            opening = self.start_zenoh(config, &gateways, listeners.grpc_address()).await?;
+            unconnected = self.start_zenoh(config, &gateways, listeners.grpc_address()).await?;
         }
         self.start_engines(config, prepared, driver, header)?;
         #[cfg(feature = "zenoh")]
         {
             let control = self.recorder.as_ref().map(Recorder::control);
-            if let Some(over_zenoh) = &mut *self.connected.0.lock().await {
+            if let Some(over_zenoh) = &mut *self.connected.lock().await {
                 over_zenoh.serve_recorder(config, control.as_ref()).await?;
             }
-            if let Some((opening, users)) = opening {
-                self.connecting.spawn(opening.finish(users, control, self.connected.clone()));
+            if let Some((settings, users)) = unconnected {
+                self.connecting.spawn(router::connect(settings, users, control, self.connected.clone()));
             }
         }
         if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
@@ -195,31 +195,35 @@ impl Running {
         self.start_udp(sockets)
     }
 
-    /// Opens the zenoh session and starts what uses it. A router that does not answer is waited for later: then the
-    /// attempts are returned.
+    /// Opens the zenoh session and starts what uses it. Returns the settings and the users of a session whose router does
+    /// not answer; such a session is opened later.
     #[cfg(feature = "zenoh")]
     async fn start_zenoh(
         &mut self,
         config: &Config,
         gateways: &Gateways,
         grpc: Option<SocketAddr>,
-    ) -> Result<Option<(Opening, Users)>, StartError> {
+    ) -> Result<Option<(zenoh::Config, Users)>, StartError> {
         let names = config.vehicles.iter().map(|vehicle| &*vehicle.name);
         let settings = zenoh_session::settings(&config.zenoh, gateways.message_bytes_max(), names)?;
         let queues = self.inputs.iter().map(|input| input.queue.clone()).collect();
         let (vehicles, fleet) = (self.vehicles.clone(), self.fleet.clone());
         let users = Users { config: config.clone(), vehicles, gateways: gateways.clone(), queues, fleet, grpc };
-        let session = match config.zenoh.mode {
-            ZenohMode::Client => {
-                let mut opening = Opening::begin(settings, &users);
-                let Some(session) = opening.first().await else { return Ok(Some((opening, users))) };
-                session
+        let is_client = config.zenoh.mode == ZenohMode::Client;
+        if is_client {
+            let endpoints = config.zenoh.connect.clone();
+            self.connecting.spawn(router::watch(self.connected.clone(), endpoints, self.vehicles.clone()));
+        }
+        let session = match zenoh_session::open(settings.clone(), &config.zenoh).await {
+            Err(error) if is_client => {
+                tracing::debug!(%error, "no session");
+                return Ok(Some((settings, users)));
             }
-            ZenohMode::Peer | ZenohMode::Router => zenoh_session::open(settings, &config.zenoh).await?,
+            session => session?,
         };
         let over_zenoh = OverZenoh::start(session, &users).await?;
         self.zenoh = over_zenoh.endpoints().await;
-        *self.connected.0.lock().await = Some(over_zenoh);
+        *self.connected.lock().await = Some(over_zenoh);
         Ok(None)
     }
 

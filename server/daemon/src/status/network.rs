@@ -23,23 +23,11 @@ pub struct Away {
     pub reason: String,
 }
 
-/// What a connected router does not deliver.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Undelivered {
-    /// Since when.
-    pub since: Instant,
-    /// The routers' endpoints.
-    pub endpoints: String,
-    /// The key on which the server publishes and a reader behind the router receives nothing.
-    pub key: String,
-}
-
 /// What is known of the network, for the status of one vehicle.
 #[derive(Debug, Default)]
 pub struct Network {
     listener_fault: Mutex<String>,
     router: Mutex<Option<Away>>,
-    undelivered: Mutex<Option<Undelivered>>,
     /// What each certificate is, by its key in the configuration, and its end in seconds since the Unix epoch.
     certificates: Mutex<Vec<(&'static str, i64)>>,
     /// Why the configuration was not read again at the newest SIGHUP; `None` if it was, or there was none.
@@ -62,11 +50,6 @@ impl Network {
         *locked(&self.router) = away;
     }
 
-    /// Notes that the router delivers nothing of this server; `None`: it does, or that is not known.
-    pub fn set_undelivered(&self, undelivered: Option<Undelivered>) {
-        *locked(&self.undelivered) = undelivered;
-    }
-
     /// Notes when the certificates end, by their keys in the configuration, in seconds since the Unix epoch.
     pub fn set_certificates(&self, ends: &[(&'static str, i64)]) {
         ends.clone_into(&mut locked(&self.certificates));
@@ -87,9 +70,8 @@ impl Network {
         let away = locked(&self.router).clone().and_then(|away| away_text(&away, now));
         let of_certificate = |(name, end_s): &(&'static str, i64)| end_text(name, *end_s, now_ns / 1_000_000_000);
         let ends: Vec<_> = locked(&self.certificates).iter().filter_map(of_certificate).collect();
-        let undelivered = locked(&self.undelivered).as_ref().map(|undelivered| undelivered_text(undelivered, now));
         let refused_reload = locked(&self.refused_reload).as_deref().map(reload_text);
-        away.into_iter().chain(undelivered).chain(ends).chain(refused_reload).collect()
+        away.into_iter().chain(ends).chain(refused_reload).collect()
     }
 }
 
@@ -97,14 +79,6 @@ fn reload_text(reason: &str) -> String {
     format!(
         "the configuration was not read again at the newest SIGHUP: {reason}; certificates, tokens, roles and limits \
          are those of before"
-    )
-}
-
-fn undelivered_text(Undelivered { since, endpoints, key }: &Undelivered, now: Instant) -> String {
-    let lasts = seconds(now.saturating_duration_since(*since));
-    format!(
-        "the zenoh router at {endpoints} delivers nothing of this server for {lasts} (tried with {key}): its readers \
-         get no maps; its access control must let this server put"
     )
 }
 
@@ -152,18 +126,6 @@ mod tests {
         assert_eq!(network.problems(at(12), 0), [text]);
         network.set_away(None);
         assert_eq!(network.problems(at(13), 0), Vec::<String>::new());
-    }
-
-    #[test]
-    fn a_router_that_delivers_nothing_is_named_with_the_key_and_the_cause() {
-        let (network, start) = (Network::default(), Instant::now());
-        let (endpoints, key) = ("tls/router:7447".to_owned(), "clearway/car/status".to_owned());
-        network.set_undelivered(Some(Undelivered { since: start, endpoints, key }));
-        let text = "the zenoh router at tls/router:7447 delivers nothing of this server for 12 s (tried with \
-                    clearway/car/status): its readers get no maps; its access control must let this server put";
-        assert_eq!(network.problems(start + Duration::from_secs(12), 0), [text]);
-        network.set_undelivered(None);
-        assert_eq!(network.problems(start, 0), Vec::<String>::new());
     }
 
     #[test]
