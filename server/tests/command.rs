@@ -152,7 +152,7 @@ fn a_sensor_model_is_listed_in_the_help_and_read_in_each_way_to_write_it() {
         let arguments = ["simulate", "flat", "--seconds", "0.1", "--out", file.to_str().unwrap(), "--sensor", sensor];
         text(&clearway(&arguments).stdout)
     };
-    assert!(simulated("hdl64e").contains("with the sensor hdl64e_s2"));
+    assert!(simulated("HDL-64E S2").contains("with the sensor hdl64e_s2"));
     assert!(simulated("VLP-16").contains("with the sensor vlp16"));
     let refused = clearway(&["replay", "a.pcap", "--model", "hdl64e"]);
     let error = text(&refused.stderr);
@@ -224,7 +224,7 @@ fn options_that_would_have_no_effect_are_refused() {
         (&["replay", path, "--topic", "/points"], 2, "--topic /points: the files have no topics"),
         (&["replay", path, "--record", path], 2, "this file is replayed; name another file"),
         (&["simulate", "flat", "--out", "x.pcap", "--telemetry-to", to], 3, "--telemetry-to"),
-        (&["send", path, "--to", to, "--seed", "7"], 3, "--seed needs a fault of the network"),
+        (&["send", path, "--to", to, "--network", "seed=7"], 3, "a fault of the network is needed"),
         (&["watch", "--zenoh", "tcp/localhost:1", "--server", "localhost:1"], 3, "--server"),
         (&["check", "--default", "--config", "a.toml"], 3, "--config"),
     ];

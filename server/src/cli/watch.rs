@@ -151,7 +151,7 @@ fn drawn(newest: Option<&Update>, said: String, screen: &Screen, options: &Optio
     let layer = map.layers().first().context("the map has no layer")?;
     let (rows, columns) = screen.size();
     let size = (rows.saturating_sub(1), columns);
-    let mut lines = drawing::lines(layer, options.range, size, screen.is_live())?;
+    let mut lines = drawing::lines(layer, options.range, size, screen.is_live());
     lines.push(truncate_str(&said, columns, "…").into_owned());
     Ok(lines)
 }

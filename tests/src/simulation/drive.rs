@@ -2,12 +2,12 @@
 
 use std::sync::OnceLock;
 
-use clearway::cli::make::demo::rig::Rig;
 use clearway_daemon::config::Config;
 use clearway_proto::v1;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
 use clearway_sim::vehicle::Datagram;
+use clearway_tools::demo::rig::Rig;
 
 use super::fault_plan::{END_NS, REVOLUTION_NS};
 

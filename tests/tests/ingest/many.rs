@@ -5,14 +5,14 @@ use std::collections::BTreeMap;
 use std::iter::Peekable;
 use std::net::UdpSocket;
 
-use clearway::cli::make::demo::car::address;
-use clearway::cli::make::demo::rig::{Rig, TimedObservation};
 use clearway_client::{Client, MapView};
 use clearway_daemon::config::{Sender, Udp};
 use clearway_mapping::config::BodyConfig;
 use clearway_proto::v1;
 use clearway_sim::traffic::{Footprints, street};
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
+use clearway_tools::demo::car::address;
+use clearway_tools::demo::rig::{Rig, TimedObservation};
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, Unit};
 
 use crate::fixture::{config, start, until, within};

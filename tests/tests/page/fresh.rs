@@ -4,9 +4,9 @@ use std::net::SocketAddr;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use clearway::cli::make::demo::report::{Report, Summary};
-use clearway::cli::make::demo::sensors::Sensors;
-use clearway::cli::make::demo::{Endpoints, Options, demo};
+use clearway_tools::demo::report::{DemoReport, DemoSummary};
+use clearway_tools::demo::sensors::DemoSensors;
+use clearway_tools::demo::{DemoEndpoints, DemoOptions, demo};
 
 use crate::page::webdriver::Browser;
 
@@ -36,7 +36,7 @@ pub fn the_page_shows_a_fresh_map() {
     let fresh_percent_min = if seconds.is_some() { FRESH_PERCENT_MIN } else { 1 };
     let seconds: u64 = seconds.map_or(30, |text| text.parse().expect("CLEARWAY_PAGE_SECONDS is a number"));
     let looks = LOOKS_MIN.max(seconds / LOOK_EVERY_S);
-    let demo = RunningDemo::start(Sensors::Auto);
+    let demo = RunningDemo::start(DemoSensors::Auto);
     let browser = Browser::start(1440, 900);
     browser.open(&format!("http://{}/", demo.page));
     // With one vehicle the page opens on it.
@@ -107,20 +107,20 @@ fn looks_well_on_a_phone(demo: &RunningDemo) {
 pub struct RunningDemo {
     pub page: SocketAddr,
     stop: tokio::sync::oneshot::Sender<()>,
-    thread: std::thread::JoinHandle<Summary>,
+    thread: std::thread::JoinHandle<DemoSummary>,
 }
 
 impl RunningDemo {
-    pub fn start(sensors: Sensors) -> Self {
+    pub fn start(sensors: DemoSensors) -> Self {
         let (stop, stopped) = tokio::sync::oneshot::channel();
         let (send_page, page) = mpsc::channel();
         let thread = std::thread::spawn(move || {
-            let options = Options { any_port: true, sensors, ..Options::default() };
-            let begun = move |endpoints: &Endpoints| {
+            let options = DemoOptions { any_port: true, sensors, ..DemoOptions::default() };
+            let begun = move |endpoints: &DemoEndpoints| {
                 println!("sensors: {}", endpoints.sensors);
                 send_page.send(endpoints.page).expect("the test waits");
             };
-            let report = |report: &Report| println!("{}", report.line());
+            let report = |report: &DemoReport| println!("{}", report.line());
             let stopped = async {
                 let _ = stopped.await;
             };
@@ -130,7 +130,7 @@ impl RunningDemo {
         Self { page: page.recv_timeout(START_MAX).expect("the demo starts"), stop, thread }
     }
 
-    pub fn stop(self) -> Summary {
+    pub fn stop(self) -> DemoSummary {
         self.stop.send(()).expect("the demo still runs");
         self.thread.join().expect("the demo ends well")
     }

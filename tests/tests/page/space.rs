@@ -1,6 +1,6 @@
 //! The view in 3-D beside a simulated drive.
 
-use clearway::cli::make::demo::sensors::Sensors;
+use clearway_tools::demo::sensors::DemoSensors;
 
 use crate::page::fresh::RunningDemo;
 use crate::page::webdriver::Browser;
@@ -24,7 +24,7 @@ const POINTS_MIN: u32 = 5000;
 
 pub fn a_drive_is_shown_in_3d() {
     // The browser has no graphics card: few points and a small window leave it time to draw.
-    let demo = RunningDemo::start(Sensors::Vlp16);
+    let demo = RunningDemo::start(DemoSensors::Vlp16);
     let browser = Browser::start(1100, 700);
     browser.open(&format!("http://{}/", demo.page));
     browser.until("a map", "return document.getElementById('freshness').textContent !== 'NO MAP YET'");

@@ -7,7 +7,6 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use clearway::cli::make::demo::rig::Rig;
 use clearway::cli::replay::{Options, replay};
 use clearway_daemon::config::Config;
 use clearway_daemon::ingest::observation;
@@ -23,6 +22,7 @@ use clearway_proto::delta::encode_delta;
 use clearway_proto::v1;
 use clearway_sim::scenes::{Scene, town};
 use clearway_sim::traffic::street;
+use clearway_tools::demo::rig::Rig;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use prost::Message;
 

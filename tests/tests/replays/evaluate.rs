@@ -1,10 +1,10 @@
-//! `clearway evaluate` on the labelled SemanticKITTI frame and its variations, on a log of Argoverse 2, and beside
+//! `clearway evaluate` on the labelled SemanticKITTI frame and its variations, on a sweep of Argoverse 2, and beside
 //! Patchwork++: the targets, and the errors for files that do not match.
 
 use std::path::Path;
 
-use clearway::cli::checks::evaluate::{Options, evaluate};
 use clearway_tests::{binaries, run};
+use clearway_tools::evaluate::{EvaluateOptions, evaluate};
 use serde_json::Value;
 
 /// Least F1 of the ground points by the shared estimate on the labelled frame and its variations: that of Patchwork++
@@ -26,15 +26,16 @@ fn evaluated(arguments: &[&str]) -> Value {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn drivability_of_the_labelled_frame_meets_its_targets() {
     // The scan and its labels lie in folders side by side; two more scans there, and ten .pcd, have no labels.
-    for (columns, precision, road) in [("1", 0.9995, 0.99), ("2", 0.997, 0.98), ("4", 0.997, 0.97)] {
-        let report = evaluated(&[&kitti(), "--columns", columns]);
+    for (degrees, precision, road) in [(1, 0.9995, 0.99), (2, 0.997, 0.98), (4, 0.997, 0.97)] {
+        let columns = format!("vehicle.maps.drivability.columns={}", 360 / degrees);
+        let report = evaluated(&[&kitti(), "--set", &columns]);
         let source = &report["sources"][0];
         assert_eq!((source["frames"].as_u64(), source["scans_without_labels"].as_u64()), (Some(1), Some(12)));
         let maps = source["maps"].as_array().expect("maps");
         let map = maps.iter().find(|map| map["layer"] == "drivability").expect("drivability");
         let metric = |pointer: &str| map.pointer(pointer).and_then(Value::as_f64).expect(pointer);
         println!(
-            "{columns}°: cells {:.5} / {:.5}, road {:.5}, ground points {:.4} / {:.4}, leaks {}",
+            "{degrees}°: cells {:.5} / {:.5}, road {:.5}, ground points {:.4} / {:.4}, leaks {}",
             metric("/cells/precision"),
             metric("/cells/recall"),
             metric("/road/recall"),
@@ -46,7 +47,7 @@ fn drivability_of_the_labelled_frame_meets_its_targets() {
         assert!(metric("/cells/recall") >= 0.95);
         let classes = map["leaks"]["by_class"].as_object().expect("leaks by class");
         for grave in ["person", "car", "pole", "fence"] {
-            assert!(columns != "1" || !classes.contains_key(grave), "{grave}: {classes:?}");
+            assert!(degrees != 1 || !classes.contains_key(grave), "{grave}: {classes:?}");
         }
     }
 }
@@ -107,9 +108,17 @@ fn every_variation_of_the_labelled_frame_is_judged() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn a_folder_of_logs_of_argoverse_is_judged_by_their_maps_of_the_ground() {
-    let logs = Path::new(env!("CLEARWAY_DRIVES")).join("argoverse2");
-    let report = evaluated(&[&logs.display().to_string()]);
+fn a_sweep_of_argoverse_is_judged_by_its_map_of_the_ground() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let drive = Path::new(env!("CLEARWAY_DRIVES")).join("argoverse2/adcf7d18-0510-35b0-a2fa-b4cea13a6d76");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/peers/argoverse.py");
+    let venv = Path::new(env!("CARGO_TARGET_TMPDIR")).join("python-argoverse");
+    let mut command = std::process::Command::new("python3");
+    command.arg("-B").arg(script).arg("--venv").arg(venv).arg(drive).arg(folder.path());
+    let output = command.output().expect("Debian's python3 and python3-venv, and a package registry");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let mount = String::from_utf8(output.stdout).expect("the mount of the sensor");
+    let report = evaluated(&[&folder.path().display().to_string(), "--extrinsics", mount.trim()]);
     let row = &report["sources"][0]["rows"][0];
     assert_eq!(row["frames"], 1);
     let maps = row["maps"].as_array().expect("maps");
@@ -132,12 +141,12 @@ fn patchwork_is_judged_on_the_same_points_as_the_maps() {
     command.arg("-B").arg(script).arg("--json").arg("--venv").arg(venv);
     let output = command
         .arg(binaries().join("clearway"))
-        .args([&kitti(), "--bend", "6"])
+        .args([&kitti(), "--variations", "bend+6"])
         .output()
         .expect("Debian's python3 and python3-venv, and a package registry");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let rows: Value = serde_json::from_slice(&output.stdout).expect("one object");
-    let row = &rows["bend +6 %"];
+    let row = &rows["bend+6"];
     for protocol in ["vegetation_excluded", "low_vegetation_ground"] {
         let peer = row["patchwork++"]["ground_points"][protocol]["f1"].as_f64().expect("Patchwork++");
         let own = row["clearway"]["ground"]["ground_points"][protocol]["f1"].as_f64().expect("Clearway");
@@ -150,7 +159,7 @@ fn patchwork_is_judged_on_the_same_points_as_the_maps() {
 fn a_variant_of_the_papers_is_selected_without_a_configuration() {
     let report = |set: &[&str]| {
         let set = set.iter().map(|text| (*text).to_owned()).collect();
-        evaluate(&Options { paths: vec!["sim:flat".into()], set, ..Options::default() }, |_, _| {})
+        evaluate(&EvaluateOptions { paths: vec!["sim:flat".into()], set, ..EvaluateOptions::default() }, |_, _| {})
     };
     let cells = |set: &[&str]| {
         let report = report(set).expect("a report").to_json();

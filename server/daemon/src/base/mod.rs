@@ -5,11 +5,13 @@
 //! | [`clock`] | the wall clock -> nanoseconds |
 //! | `sync` | a mutex -> its value, also after a panic |
 //! | [`directory`] | the name of a vehicle -> what is served for it |
+//! | [`files`] | a path of the command line -> an open file, or an error that says what to do |
 //! | [`held_sockets`] | sockets that systemd holds -> listeners |
 //! | `token_bucket` | messages of a client -> whether its rate is within a limit |
 
 pub mod clock;
 pub mod directory;
+pub mod files;
 pub mod held_sockets;
 pub mod sync;
 pub mod token_bucket;

@@ -59,7 +59,7 @@ pub struct Options {
     #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     pub extrinsics: Option<Extrinsics>,
     /// Model of every sensor, if the data names the wrong one or none; of scans, the model whose elevations they have.
-    #[arg(long, value_parser = ModelParser::any())]
+    #[arg(long, value_parser = ModelParser)]
     pub model: Option<Model>,
     /// Rotation rate of every sensor, in revolutions per minute, if the data gives the wrong one or none.
     #[arg(long)]

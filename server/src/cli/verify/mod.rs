@@ -24,6 +24,7 @@ use crate::cli::shared::output::{print, print_line, printable};
 
 mod checked;
 mod files;
+#[cfg(feature = "tools")]
 mod pictures;
 mod report;
 mod same_drive;
@@ -85,6 +86,7 @@ struct Change {
     /// Number of the maps that changed most to list for each recording.
     #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u16).range(0..=1000))]
     worst: u16,
+    #[cfg(feature = "tools")]
     /// Draw these maps to this folder: before, after, and what changed.
     #[arg(long, value_name = "FOLDER")]
     pictures: Option<PathBuf>,
@@ -111,6 +113,7 @@ impl Change {
 /// If the configuration is wrong, or a report or a picture cannot be written.
 pub fn run(options: &Options) -> Result<Exit> {
     let check = options.change.check()?;
+    #[cfg(feature = "tools")]
     if let (Some(_), Check::Verify) = (&options.change.pictures, &check) {
         return Err(crate::cli::shared::output::usage_error("--pictures needs --config, --set or --against"));
     }
@@ -121,6 +124,7 @@ pub fn run(options: &Options) -> Result<Exit> {
         // In the reports too: a machine that collects them has to find the reason.
         Err(error) => vec![Checked::not_found(&options.files, format!("{error:#}"))],
     };
+    #[cfg(feature = "tools")]
     if let Some(folder) = &options.change.pictures {
         one_file::create_folder(folder)?;
         results.iter_mut().try_for_each(|result| pictures::draw(result, folder))?;

@@ -6,11 +6,7 @@ use anyhow::Result;
 
 use super::checked::{Checked, Outcome};
 use crate::cli::shared::files;
-use clearway_daemon::encode::picture::{self, Picture, Style};
-use clearway_journal::compare::MapChange;
-
-/// Edge of each of the three maps, in pixels; ours, because three of them fit a screen.
-const PIXELS: u32 = 480;
+use clearway_tools::picture::change::before_after_change;
 
 /// Draws the maps of a result that changed most into `folder`, and adds the files to the result.
 ///
@@ -31,21 +27,6 @@ pub fn draw(result: &mut Checked, folder: &Path) -> Result<()> {
 fn stem(recording: &Path) -> String {
     let name = recording.with_extension("").display().to_string().replace(['/', '\\'], "_");
     name.trim_start_matches(['.', '_']).to_owned()
-}
-
-fn before_after_change(map: &MapChange) -> Result<Picture> {
-    let style = |caption: String| Style { pixels: PIXELS, caption: vec![caption], ..Style::default() };
-    let title = |side| format!("{} {} {}: {side}", map.vehicle, map.after.name, map.sequence);
-    let change =
-        format!("{:.2} % changed, {:.1} m2 gained, {:.1} m2 lost", 100.0 * map.share(), map.gained_m2, map.lost_m2);
-    Ok(Picture::sheet(
-        &[
-            picture::of_layer(&map.before, &style(title("before")))?,
-            picture::of_layer(&map.after, &style(title("after")))?,
-            picture::of_change(&map.before, &map.after, &style(change)),
-        ],
-        3,
-    ))
 }
 
 #[cfg(test)]

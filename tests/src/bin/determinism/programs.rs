@@ -56,7 +56,7 @@ pub fn build() -> Vec<Program> {
     let built = builds.into_iter().map(|(name, target, profile, flags)| {
         eprintln!("building {name}");
         let mut cargo = Command::new(env!("CARGO"));
-        cargo.args(["build", "--package", "clearway", "--no-default-features", "--features", "sim", "--target-dir"]);
+        cargo.args(["build", "--package", "clearway", "--no-default-features", "--features", "tools", "--target-dir"]);
         cargo.arg(&target).current_dir(workspace());
         if profile == "release" {
             cargo.arg("--release");

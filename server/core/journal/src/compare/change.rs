@@ -21,26 +21,18 @@ pub enum Change {
 }
 
 impl Change {
-    /// The change at a point of the ego frame, in metres.
-    pub fn at(before: &Layer, after: &Layer, x_m: f64, y_m: f64) -> Self {
-        let (Some(was), Some(is)) = (before.grid.cell_at(x_m, y_m), after.grid.cell_at(x_m, y_m)) else {
-            return Self::Unknown;
-        };
-        Self::of(before, was, after, is)
-    }
-
-    /// The change from cell `was` of the layer `before` to cell `is` of the layer `after`.
-    pub fn of(before: &Layer, was: usize, after: &Layer, is: usize) -> Self {
-        let meanings = (before.meaning_of(was), after.meaning_of(is));
-        match meanings {
-            _ if class_name(before, was) == class_name(after, is) => match meanings.1 {
+    /// The change from a cell of the layer `before` to a cell of the layer `after`.
+    pub fn of(before: &Layer, cell_before: usize, after: &Layer, cell_after: usize) -> Self {
+        let (old, new) = (before.meaning_of(cell_before), after.meaning_of(cell_after));
+        match (old == ClassMeaning::Free, new == ClassMeaning::Free) {
+            _ if class_name(before, cell_before) == class_name(after, cell_after) => match new {
                 ClassMeaning::Unknown => Self::Unknown,
                 ClassMeaning::Free => Self::Free,
                 _ => Self::Closed,
             },
-            (was, is) if (was == ClassMeaning::Free) == (is == ClassMeaning::Free) => Self::Other,
-            (_, ClassMeaning::Free) => Self::FreeGained,
-            _ => Self::FreeLost,
+            (false, true) => Self::FreeGained,
+            (true, false) => Self::FreeLost,
+            _ => Self::Other,
         }
     }
 }

@@ -22,7 +22,7 @@ use clearway_proto::map::Layer;
 use clearway_proto::v1::ClassMeaning;
 use nalgebra::{Isometry3, Vector3};
 
-use crate::encode::picture::Colours;
+use crate::encode::colours::Colours;
 
 /// Edge of the cells to which radial layers are resampled, in metres: that of the other layers.
 const CELL_M: f64 = 0.25;
@@ -111,7 +111,7 @@ impl Raster {
         }
     }
 
-    /// Red, green, blue and alpha of each cell of a layer with this grid, in the colours of [`crate::encode::picture`].
+    /// Red, green, blue and alpha of each cell of a layer with this grid, in the colours of [`Colours`].
     /// Squares outside a radial grid are transparent.
     pub fn rgba(&self, layer: &Layer) -> Vec<u8> {
         let colours = Colours::of_layer(layer);

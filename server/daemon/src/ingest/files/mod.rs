@@ -8,9 +8,11 @@
 //! |---|---|
 //! | [`capture`] | pcap, pcapng -> readings |
 //! | [`mcap`] | recording or ROS 2 bag, in MCAP or sqlite -> readings |
+//! | [`ground_revolutions`] | revolutions -> the points from which a mount is estimated |
 //! | [`kitti`] | one scan, `.bin`, `.pcd.bin` or `.pcd` -> reading |
 
 pub mod capture;
+pub mod ground_revolutions;
 pub mod kitti;
 pub mod mcap;
 

@@ -1,3 +1,0 @@
-//! The subcommand that writes recordings in other formats.
-
-pub(super) mod export;

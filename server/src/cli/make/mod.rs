@@ -1,4 +1,0 @@
-//! The subcommand that drives a simulated vehicle.
-
-#[cfg(feature = "sim")]
-pub mod demo;

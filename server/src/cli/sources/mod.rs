@@ -1,4 +1,0 @@
-//! The subcommand that simulates a drive.
-
-#[cfg(feature = "sim")]
-pub(super) mod simulate;

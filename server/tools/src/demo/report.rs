@@ -1,0 +1,159 @@
+//! The state of a running demo, once a second and at its end.
+//!
+//! In: the vehicle's status, the car's skipped time. Out: a line for people, or JSON.
+
+use std::time::Duration;
+
+use clearway_sim::send::Sent;
+use serde_json::{Value, json};
+
+use clearway_daemon::status::Snapshot;
+use clearway_journal::counted::counted;
+
+/// The state of the demo at one moment.
+#[derive(Clone, Debug)]
+pub struct DemoReport {
+    /// Time since the car started.
+    pub elapsed: Duration,
+    /// Ledger, rates, latency.
+    pub snapshot: Snapshot,
+    /// Age of the newest map, from the end of its capture, in ms; `None` before the first map.
+    pub age_ms: Option<f64>,
+    /// How long a map is valid after the end of its capture.
+    pub validity: Duration,
+    /// Simulated time skipped since the start, because the machine is too slow.
+    pub skipped: Duration,
+    /// The part of `skipped` since the report before.
+    pub newly_skipped: Duration,
+    /// The sensors' name in a line.
+    pub sensors: &'static str,
+}
+
+/// The end of a demo.
+#[derive(Clone, Debug)]
+pub struct DemoSummary {
+    /// The last report, with complete counts.
+    pub last: DemoReport,
+    /// What the car sent.
+    pub sent: Sent,
+}
+
+impl Default for DemoReport {
+    fn default() -> Self {
+        Self {
+            elapsed: Duration::ZERO,
+            snapshot: Snapshot::default(),
+            age_ms: None,
+            validity: Duration::ZERO,
+            skipped: Duration::ZERO,
+            newly_skipped: Duration::ZERO,
+            sensors: "HDL-64E",
+        }
+    }
+}
+
+impl DemoReport {
+    /// The report that follows this one.
+    pub fn next(&self, elapsed: Duration, snapshot: Snapshot, age_ms: Option<f64>, skipped: Duration) -> Self {
+        let newly_skipped = skipped.saturating_sub(self.skipped);
+        Self { elapsed, snapshot, age_ms, skipped, newly_skipped, ..*self }
+    }
+
+    /// True if the newest map is older than it is valid.
+    pub fn is_stale(&self) -> bool {
+        self.age_ms.is_some_and(|age_ms| age_ms > self.validity.as_secs_f64() * 1e3)
+    }
+
+    /// The report in one line.
+    pub fn line(&self) -> String {
+        let number = |value: Option<f64>, unit: &str| value.map_or("-".into(), |value| format!("{value:.1} {unit}"));
+        let mut line = format!(
+            "{:>4} s  {:>18}  {:>16}  {} refused  {} lost  age {}{}  latency {}  drivable {}",
+            self.elapsed.as_secs(),
+            counted(self.snapshot.revolutions(), "revolution"),
+            counted(self.snapshot.ledger.received, "packet"),
+            self.snapshot.refused(),
+            self.snapshot.ledger.lost + self.snapshot.ledger.kernel_drops,
+            number(self.age_ms, "ms"),
+            if self.is_stale() { " STALE" } else { "" },
+            number(self.snapshot.latency_ms_p50, "ms"),
+            number(self.snapshot.drivable_share.map(|share| 100.0 * share), "%"),
+        );
+        if !self.newly_skipped.is_zero() {
+            let (seconds, sensors) = (self.newly_skipped.as_secs_f64(), self.sensors);
+            line += &format!("  simulation skipped {seconds:.1} s: this machine is too slow for {sensors}");
+        }
+        line
+    }
+
+    /// The report as a JSON object.
+    pub fn to_json(&self) -> Value {
+        let snapshot = &self.snapshot;
+        json!({
+            "seconds": self.elapsed.as_secs_f64(),
+            "revolutions": snapshot.revolutions(),
+            "maps": snapshot.maps,
+            "packets": snapshot.packets_json(),
+            "telemetry": snapshot.ledger.telemetry,
+            "lost": snapshot.ledger.lost,
+            "kernel_drops": snapshot.ledger.kernel_drops,
+            "age_ms": self.age_ms,
+            "stale": self.is_stale(),
+            "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
+            "drivable_share": snapshot.drivable_share,
+            "simulation_skipped_s": self.skipped.as_secs_f64(),
+        })
+    }
+}
+
+impl DemoSummary {
+    /// The summary as text.
+    pub fn text(&self) -> String {
+        let (sent, last) = (&self.sent, &self.last.snapshot);
+        let mut text = format!(
+            "The car sent {} and {}; {} received, {} made.",
+            counted(sent.packets, "data packet"),
+            counted(sent.telemetry, "telemetry datagram"),
+            last.ledger.received,
+            counted(last.maps, "map")
+        );
+        if !self.last.skipped.is_zero() {
+            let (skipped, all) = (self.last.skipped.as_secs_f64(), self.last.elapsed.as_secs_f64());
+            text += &format!("\nThe simulation skipped {skipped:.1} s of {all:.1} s: this machine was too slow.");
+        }
+        text
+    }
+
+    /// The summary as a JSON object.
+    pub fn to_json(&self) -> Value {
+        let mut object = self.last.to_json();
+        object["sent"] = json!({ "packets": self.sent.packets, "telemetry": self.sent.telemetry });
+        object
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn report(age_ms: f64, skipped_ms: u64) -> DemoReport {
+        let before = DemoReport { validity: Duration::from_millis(300), ..DemoReport::default() };
+        before.next(Duration::from_secs(1), Snapshot::default(), Some(age_ms), Duration::from_millis(skipped_ms))
+    }
+
+    #[test]
+    fn a_line_states_that_the_map_is_stale() {
+        assert!(report(300.5, 0).line().contains("age 300.5 ms STALE  latency"));
+        assert!(report(299.5, 0).line().contains("age 299.5 ms  latency"));
+    }
+
+    #[test]
+    fn a_line_states_what_was_skipped_since_the_line_before() {
+        let first = report(50.0, 400);
+        let text = "simulation skipped 0.4 s: this machine is too slow for HDL-64E";
+        assert!(first.line().ends_with(text), "{}", first.line());
+        let second = first.next(Duration::from_secs(2), Snapshot::default(), None, first.skipped);
+        assert!(!second.line().contains("skipped"), "{}", second.line());
+        assert_eq!(second.to_json()["simulation_skipped_s"], 0.4);
+    }
+}

@@ -1,0 +1,240 @@
+//! The demo: a server, a car that drives at it, and a report once a second.
+
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, Error, Result, anyhow};
+use clearway_proto::codec::Limits;
+use clearway_proto::map::decode_map;
+use clearway_sim::scenes::town;
+use clearway_sim::traffic::street;
+use tokio::time::MissedTickBehavior;
+
+use clearway_daemon::base::clock::now_ns;
+use clearway_daemon::config::{Config, Sender, Udp};
+use clearway_daemon::run::{Running, Server, Setup, StartError};
+use clearway_journal::encode::EncodedMap;
+
+use super::car::{self, DemoCar};
+use super::report::{DemoReport, DemoSummary};
+use super::rig::{self, Rig};
+use super::sensors::{self, DemoSensors, SensorChoice};
+use crate::picture::{self, PictureStyle};
+
+/// How long the demo waits at its end for the last datagrams, which take far less to pass through the sockets.
+const SETTLE: Duration = Duration::from_millis(500);
+/// Greatest length of a recording in MiB, beyond which its oldest parts are deleted. Ours: a quarter of an hour with an
+/// HDL-64E. A quarter for each part, so that what is kept is never much less than what is allowed.
+const RECORDING_MIB: u64 = 2048;
+
+/// What a demo does.
+#[derive(Clone, Debug, Default)]
+pub struct DemoOptions {
+    /// How long the demo runs; `None`: until `stop` resolves.
+    pub duration: Option<Duration>,
+    /// The file that events and maps are recorded to; `None`: nothing is recorded.
+    pub record: Option<PathBuf>,
+    /// The file that the newest map is drawn to every second; `None`: nothing is drawn.
+    pub picture: Option<PathBuf>,
+    /// The car's sensors.
+    pub sensors: DemoSensors,
+    /// True if the operating system chooses every port, for tests that run beside each other.
+    pub any_port: bool,
+}
+
+/// Where a running demo can be watched.
+#[derive(Clone, Debug)]
+pub struct DemoEndpoints {
+    /// The address of the page.
+    pub page: SocketAddr,
+    /// The address of gRPC.
+    pub grpc: SocketAddr,
+    /// zenoh's endpoints.
+    pub zenoh: Vec<String>,
+    /// The sensors, and why they were chosen.
+    pub sensors: String,
+    /// Ports that differ from the usual ones, and why.
+    pub notes: Vec<String>,
+}
+
+/// Drives until the duration has passed or `stop` resolves. Calls `begun` when the server runs, and `report` once a
+/// second. Needs a multi-thread tokio runtime.
+///
+/// # Errors
+/// If the server does not start or end as it should, or the car cannot send; nothing is left running.
+pub async fn demo(
+    options: DemoOptions,
+    begun: impl FnOnce(&DemoEndpoints),
+    mut report: impl FnMut(&DemoReport),
+    stop: impl Future<Output = ()>,
+) -> Result<DemoSummary> {
+    let choice = tokio::task::block_in_place(|| SensorChoice::new(options.sensors));
+    let rig = |start_ns| rig(options.sensors, &choice, start_ns);
+    let (config, notes) = configuration(&options, &rig(0));
+    let validity = Duration::from_millis(config.vehicles[0].maps.valid_ms.into());
+    let running = Server::start(Setup { config, ..Setup::default() }).await.map_err(with_hint)?;
+    let nowhere = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
+    begun(&DemoEndpoints {
+        page: running.page.unwrap_or(nowhere),
+        grpc: running.grpc.unwrap_or(nowhere),
+        zenoh: running.zenoh.clone(),
+        sensors: describe(options.sensors, &choice),
+        notes,
+    });
+    let udp = running.inputs[0].udp.unwrap_or((nowhere, nowhere));
+    let served = running.vehicles.0[0].clone();
+    // The picture and the line need this layer, whether or not a reader subscribes to it.
+    let _subscription = served.status.subscriptions.subscribe(&["drivability".to_owned()]);
+    // The car starts after everything else, so that its first firing is now.
+    let car = DemoCar::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere), &served.newest)
+        .context("the simulated car")?;
+
+    let began = tokio::time::Instant::now();
+    let end = async {
+        match options.duration {
+            Some(duration) => tokio::time::sleep_until(began + duration).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::pin!(stop, end);
+    let sensors = if options.sensors == DemoSensors::Many { "eight sensors" } else { sensors::name(choice.model) };
+    let mut last = DemoReport { validity, sensors, ..DemoReport::default() };
+    let now = |running: &Running, last: &DemoReport| {
+        let snapshot = running.vehicles.0[0].status.snapshot();
+        let age_ms = (snapshot.maps > 0).then(|| (now_ns() - snapshot.newest_capture_end_ns) as f64 / 1e6);
+        last.next(began.elapsed(), snapshot, age_ms, car.skipped())
+    };
+    let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
+    every.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    loop {
+        tokio::select! {
+            biased;
+            () = &mut stop => break,
+            () = &mut end => break,
+            _ = every.tick() => {
+                last = now(&running, &last);
+                report(&last);
+                let newest = served.newest.borrow().clone();
+                if let Some((map, picture)) = newest.zip(options.picture.as_deref()) {
+                    let drawn = tokio::task::block_in_place(|| draw(&map, picture));
+                    drawn.unwrap_or_else(|error| tracing::warn!("picture {}: {error:#}", picture.display()));
+                }
+            }
+        }
+        if car.has_stopped() {
+            break;
+        }
+    }
+    last = now(&running, &last);
+    let sent = car.stop().await;
+    let status = running.vehicles.0[0].status.clone();
+    let some_are_on_the_way = || {
+        let ledger = status.snapshot().ledger;
+        let accounted = ledger.received + ledger.lost + ledger.kernel_drops;
+        sent.as_ref().is_ok_and(|sent| accounted < sent.packets + sent.telemetry)
+    };
+    let settled = tokio::time::Instant::now() + SETTLE;
+    while some_are_on_the_way() && tokio::time::Instant::now() < settled {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    running.shutdown().await?;
+    let sent = sent?;
+    // The counts are complete only now.
+    Ok(DemoSummary { last: DemoReport { snapshot: status.snapshot(), ..last }, sent })
+}
+
+/// Draws a map's drivability. A reader of the file sees a whole picture, either the old or the new one.
+fn draw(map: &EncodedMap, file: &Path) -> Result<()> {
+    let map = decode_map(map.select(&["drivability".into()]), &Limits::default())?;
+    let Some(layer) = map.layer("drivability") else { return Ok(()) };
+    let unfinished = file.with_extension("png.part");
+    std::fs::write(&unfinished, picture::png(layer, &PictureStyle { pixels: 640, ..PictureStyle::default() })?)?;
+    Ok(std::fs::rename(&unfinished, file)?)
+}
+
+/// The error of a start, with what to do about a port that was free when the demo looked and in use when its server
+/// started, as happens to two demos that start at once.
+fn with_hint(error: StartError) -> Error {
+    match &error {
+        StartError::Listen { source, .. } if source.kind() == std::io::ErrorKind::AddrInUse => {
+            anyhow!("{error}; another program took this port just now: start the demo again, or with --any-port")
+        }
+        _ => error.into(),
+    }
+}
+
+/// The car; its scene begins at `start_ns`.
+fn rig(sensors: DemoSensors, choice: &SensorChoice, start_ns: i64) -> Rig {
+    match sensors {
+        DemoSensors::Many => Rig::many(street(8.0), start_ns),
+        _ => Rig::one(choice.model, town(), start_ns),
+    }
+}
+
+fn describe(sensors: DemoSensors, choice: &SensorChoice) -> String {
+    match sensors {
+        DemoSensors::Many => "two VLP-16 and six LIDARs of four planes".into(),
+        _ => choice.to_string(),
+    }
+}
+
+/// The server's configuration: the usual ports if they are free, else any; and a note on each port that is not free.
+fn configuration(options: &DemoOptions, rig: &Rig) -> (Config, Vec<String>) {
+    let mut config = Config::of_one_vehicle("car", "top");
+    let mut notes = Vec::new();
+    let mut port = |what: &str, at: SocketAddr| {
+        if options.any_port {
+            return SocketAddr::new(at.ip(), 0);
+        }
+        match TcpListener::bind(at) {
+            Ok(_) => at,
+            Err(error) => {
+                notes.push(format!("{what}: {at}: {error}; another port is used"));
+                SocketAddr::new(at.ip(), 0)
+            }
+        }
+    };
+    config.grpc.listen = port("gRPC", config.grpc.listen);
+    config.page.listen = port("page", config.page.listen);
+    let zenoh = port("zenoh", SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 7447));
+    config.zenoh.enabled = cfg!(feature = "zenoh");
+    config.zenoh.listen = vec![format!("tcp/{zenoh}")];
+    if let Some(file) = &options.record {
+        config.recorder.file = file.clone();
+        (config.recorder.keep_mb, config.recorder.part_mb) = (RECORDING_MIB, RECORDING_MIB / 4);
+    }
+    let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
+    let many = options.sensors == DemoSensors::Many;
+    let vehicle = &mut config.vehicles[0];
+    let sender =
+        |(index, (name, _)): (usize, &(String, _))| (name.clone(), Sender::Address(car::address(index).into()));
+    let from = rig.scanners.iter().enumerate().map(sender).filter(|_| many).collect();
+    vehicle.udp = Some(Udp { data: any, telemetry: any, from, ..Udp::default() });
+    vehicle.maps.speed.enabled |= many;
+    // The page's view in 3-D shows them.
+    vehicle.maps.terrain.planes = true;
+    // The rig states where its sensors are.
+    if many {
+        vehicle.sensors = rig.sensors();
+    } else {
+        vehicle.sensors[0].extrinsics = rig::extrinsics(&rig.scanners[0].1.ego_from_sensor);
+    }
+    (config, notes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_port_that_was_taken_meanwhile_is_named_with_what_to_do() {
+        let error = |kind| {
+            let at = "127.0.0.1:50051".parse().unwrap();
+            with_hint(StartError::Listen { what: "grpc", at, source: std::io::Error::from(kind) }).to_string()
+        };
+        let taken = error(std::io::ErrorKind::AddrInUse);
+        assert!(taken.starts_with("grpc.listen 127.0.0.1:50051: ") && taken.ends_with("with --any-port"), "{taken}");
+        assert!(!error(std::io::ErrorKind::PermissionDenied).contains("--any-port"));
+    }
+}

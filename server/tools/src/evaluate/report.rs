@@ -1,0 +1,248 @@
+//! The result of an evaluation, and the result as JSON. `table.rs` writes it as text.
+
+use clearway_mapping::layer::Layer;
+use clearway_mapping::pipeline::Pipeline;
+use serde_json::{Value, json};
+
+use super::judge::{JudgedPoint, judge, judge_ground};
+use super::tally::{BANDS, BANDS_M, CellCount, Confusion, Tally};
+
+/// The protocols by which ground points are scored: name and description. Both leave out points without a class
+/// (unlabeled, outlier) and the vehicle itself, and count road, parking, sidewalk, other-ground, lane-marking and
+/// terrain as ground.
+pub const PROTOCOLS: [(&str, &str); 2] = [
+    (
+        "vegetation_excluded",
+        "as in Patchwork++ (Lee 2022, section IV.A) and GroundGrid's published script: ground is road, parking, \
+         sidewalk, other-ground, lane-marking and terrain; vegetation is not scored; everything else is not ground",
+    ),
+    (
+        "low_vegetation_ground",
+        "as in Patchwork (Lim 2021): the same, except that vegetation lower than a quarter of the sensor's height \
+         above the vehicle's ground (z < -1.3 m from KITTI's sensor) is ground, and higher vegetation is not",
+    ),
+];
+
+/// Name of the class of simulated ground behind a closed fence, or behind an opening narrower than the vehicle.
+pub const UNREACHABLE: &str = "unreachable";
+
+/// Counts of one variation of the scans of a path, or of one type of world.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EvaluatedRow {
+    /// Name of the variation or type; empty if there is only one.
+    pub name: String,
+    /// True if no parameter may be tuned on these frames.
+    pub final_only: bool,
+    /// Number of frames judged.
+    pub frames: u64,
+    /// Name and counts of each layer, in the order of the map.
+    pub layers: Vec<(String, Tally)>,
+    /// Names of the layers without a free class.
+    pub left_out: Vec<String>,
+    /// Time that the maps of each frame took, in milliseconds.
+    pub step_ms: Vec<f64>,
+}
+
+impl EvaluatedRow {
+    /// Adds the counts of a pipeline's newest map, and of its estimate of the ground, against the points of its frame.
+    pub fn judge_map(&mut self, pipeline: &Pipeline, points: &[JudgedPoint]) {
+        if let Some(map) = pipeline.newest_map() {
+            self.judge(&map.layers, points);
+        }
+        if let Some(ground) = pipeline.newest_ground() {
+            let height_over_m = |[x, y, z]: [f32; 3]| Some(ground.height_over_m(x, y, z)).filter(|over| !over.is_nan());
+            self.judge_ground(points, height_over_m);
+        }
+    }
+
+    /// Adds the counts of all layers of a map against the points of its frame.
+    fn judge(&mut self, layers: &[Layer], points: &[JudgedPoint]) {
+        self.frames += 1;
+        for layer in layers {
+            let mut tally = Tally::default();
+            if judge(&mut tally, layer, points) {
+                self.tally(layer.name).merge(&tally);
+            } else if !self.left_out.iter().any(|name| name == layer.name) {
+                self.left_out.push(layer.name.to_owned());
+            }
+        }
+    }
+
+    /// Adds the counts of an estimate of the ground, under the name `ground`. `height_over_m` is the height of a
+    /// position of the ego frame over it, in metres; `None` if the estimate does not cover it.
+    fn judge_ground(&mut self, points: &[JudgedPoint], height_over_m: impl Fn([f32; 3]) -> Option<f32>) {
+        judge_ground(self.tally("ground"), points, height_over_m);
+    }
+
+    /// Adds the counts of another row.
+    pub fn merge(&mut self, other: &Self) {
+        self.frames += other.frames;
+        for (name, tally) in &other.layers {
+            self.tally(name).merge(tally);
+        }
+        for name in &other.left_out {
+            if !self.left_out.contains(name) {
+                self.left_out.push(name.clone());
+            }
+        }
+        self.step_ms.extend(&other.step_ms);
+    }
+
+    /// The counts of a layer; `None` if it was not judged.
+    pub fn layer(&self, name: &str) -> Option<&Tally> {
+        self.layers.iter().find(|(layer, _)| layer == name).map(|(_, tally)| tally)
+    }
+
+    fn tally(&mut self, name: &str) -> &mut Tally {
+        let at = self.layers.iter().position(|(layer, _)| layer == name).unwrap_or_else(|| {
+            self.layers.push((name.to_owned(), Tally::default()));
+            self.layers.len() - 1
+        });
+        &mut self.layers[at].1
+    }
+
+    /// Median time that the maps of a frame took, in milliseconds; `None` if it was not measured.
+    pub fn step_ms_p50(&self) -> Option<f64> {
+        let mut times = self.step_ms.clone();
+        times.sort_by(f64::total_cmp);
+        times.get(times.len() / 2).copied()
+    }
+}
+
+/// One random world.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EvaluatedWorld {
+    /// Seed of the world.
+    pub seed: u64,
+    /// Theme and form.
+    pub name: String,
+    /// What was drawn.
+    pub description: String,
+    /// Its counts.
+    pub row: EvaluatedRow,
+}
+
+/// The result for one path.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EvaluatedSource {
+    /// The path, as given.
+    pub path: String,
+    /// Number of scans without labels, which are left out.
+    pub unlabelled: usize,
+    /// For each folder the extrinsics of the sensor, and where they come from.
+    pub mounts: Vec<String>,
+    /// The counts of each variation, the first of which is the scans as they were recorded; or the sum of all worlds,
+    /// then each type of world.
+    pub rows: Vec<EvaluatedRow>,
+    /// The random worlds, by seed.
+    pub worlds: Vec<EvaluatedWorld>,
+}
+
+impl EvaluatedSource {
+    /// The row of this name, which is made if there is none.
+    pub fn row(&mut self, name: &str, final_only: bool) -> &mut EvaluatedRow {
+        let at = self.rows.iter().position(|row| row.name == name).unwrap_or_else(|| {
+            self.rows.push(EvaluatedRow { name: name.to_owned(), final_only, ..EvaluatedRow::default() });
+            self.rows.len() - 1
+        });
+        &mut self.rows[at]
+    }
+}
+
+/// The result for all paths.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Evaluation {
+    /// The result for each path, in the order given.
+    pub sources: Vec<EvaluatedSource>,
+}
+
+impl Evaluation {
+    /// The report as a JSON object; a share of zero cells or points is null. `maps` of a source are those of its first
+    /// row.
+    pub fn to_json(&self) -> Value {
+        let source = |source: &EvaluatedSource| {
+            let first = source.rows.first();
+            json!({
+                "path": source.path,
+                "frames": first.map_or(0, |row| row.frames),
+                "scans_without_labels": source.unlabelled,
+                "extrinsics": source.mounts,
+                "maps": first.map(maps),
+                "left_out": first.map(|row| &row.left_out),
+                "rows": source.rows.iter().map(row).collect::<Vec<_>>(),
+                "worlds": source.worlds.iter().map(world).collect::<Vec<_>>(),
+            })
+        };
+        json!({
+            "protocols": PROTOCOLS.map(|(name, words)| json!({ "name": name, "counts": words })),
+            "range_bands_m": BANDS_M,
+            "sources": self.sources.iter().map(source).collect::<Vec<_>>(),
+        })
+    }
+}
+
+fn row(row: &EvaluatedRow) -> Value {
+    json!({
+        "name": row.name,
+        "final_only": row.final_only,
+        "frames": row.frames,
+        "step_ms_p50": row.step_ms_p50(),
+        "maps": maps(row),
+        "left_out": row.left_out,
+    })
+}
+
+fn world(world: &EvaluatedWorld) -> Value {
+    json!({
+        "seed": world.seed,
+        "name": world.name,
+        "description": world.description,
+        "maps": maps(&world.row),
+    })
+}
+
+fn maps(row: &EvaluatedRow) -> Vec<Value> {
+    row.layers.iter().map(|(name, tally)| layer(name, tally)).collect()
+}
+
+fn layer(name: &str, tally: &Tally) -> Value {
+    let points = |points: &Confusion| {
+        json!({
+            "precision": points.precision(), "recall": points.recall(), "f1": points.f1(),
+            "right": points.right, "wrong": points.wrong, "missed": points.missed,
+        })
+    };
+    let occupied =
+        |count: &CellCount| json!({ "cells": count.all, "called_occupied": count.of_them, "share": count.share() });
+    let by_class: serde_json::Map<String, Value> =
+        tally.by_class.iter().map(|(class, counts)| ((*class).to_owned(), bands(counts))).collect();
+    json!({
+        "layer": name,
+        "cells": {
+            "precision": tally.precision(), "recall": tally.recall(), "f1": tally.f1(),
+            "free_of_obstacles": tally.free_of_obstacles(),
+            "called_drivable": tally.called, "called_wrongly": tally.called_wrongly,
+            "drivable": tally.drivable.all, "found": tally.drivable.of_them,
+        },
+        "road": { "recall": tally.road_recall(), "cells": tally.road.all, "found": tally.road.of_them },
+        "reach": {
+            "recall": tally.recall(),
+            "not_reached": tally.not_reached.share(),
+            "by_range": bands(&tally.by_range),
+            "by_class": by_class,
+        },
+        "false_obstacles": { "ground": occupied(&tally.ground), "pure_ground": occupied(&tally.pure_ground) },
+        "ground_points": { PROTOCOLS[0].0: points(&tally.points[0]), PROTOCOLS[1].0: points(&tally.points[1]) },
+        "leaks": {
+            "obstacle_cells": tally.leaking,
+            "behind_barriers": tally.leaks.get(UNREACHABLE).copied().unwrap_or(0),
+            "by_class": tally.leaks,
+            "cells_by_range": tally.wrong_by_range.map(|count| count.of_them),
+        },
+    })
+}
+
+fn bands(counts: &[CellCount; BANDS]) -> Value {
+    let band = |count: &CellCount| json!({ "cells": count.all, "found": count.of_them, "recall": count.share() });
+    counts.iter().map(band).collect()
+}

@@ -1,0 +1,173 @@
+//! Labelled scans and their variations -> counts.
+//!
+//! In: pairs of one folder. Out: the counts of each variation, in an [`EvaluatedSource`]. Each variation has a pipeline
+//! of its own. The truth is made once a frame, from the scan as it was recorded.
+
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context, Result, anyhow, bail};
+use clearway_daemon::ingest::files::kitti;
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{Extrinsics, MapsConfig};
+use clearway_mapping::event::{Body, Event, Scan};
+use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::sensor::mount::estimate;
+use clearway_mapping::sensor::sweep::{Mount, Sweep};
+
+use super::super::EvaluateOptions;
+use super::super::judge::{JudgedPoint, Scored, Vote};
+use super::super::report::EvaluatedSource;
+use super::labels;
+use super::pairs::LabelledScan;
+use super::pipeline;
+use super::variation::Variation;
+use super::written::{WrittenFrame, write};
+
+/// How the sensor is mounted on KITTI's car, from KITTI's published sensor setup. The published metrics of other
+/// methods use it, and an estimate from one scan tilts with the road under it.
+const KITTI_EXTRINSICS: Extrinsics =
+    Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.73, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
+/// Largest difference between the estimated height of the sensor and KITTI's, in metres; beyond it the scans are from
+/// another car. Ours.
+const MOUNT_M_OFF_MAX: f64 = 0.3;
+/// Number of scans from which the height of the sensor is estimated.
+const MOUNT_SCANS: usize = 10;
+
+/// Judges the labelled scans of one folder, in order.
+///
+/// # Errors
+/// For the first scan that cannot be judged.
+pub fn judge_folder(
+    pairs: &[LabelledScan],
+    options: &EvaluateOptions,
+    maps: &MapsConfig,
+    source: &mut EvaluatedSource,
+    judged: &mut impl FnMut(),
+) -> Result<()> {
+    let folder = pairs[0].scan.parent().unwrap_or(Path::new("")).to_owned();
+    let (extrinsics, origin) = match options.extrinsics {
+        Some(extrinsics) => (extrinsics, "as given".to_owned()),
+        None => (KITTI_EXTRINSICS, kitti_mount(&folder, pairs)?),
+    };
+    let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = extrinsics;
+    let numbers = format!("{x_m},{y_m},{z_m},{roll_deg},{pitch_deg},{yaw_deg}");
+    source.mounts.push(format!("{numbers} in {}: {origin}", folder.display()));
+    // Without rings the sensor is that of SemanticKITTI.
+    let has_rings = !read_scan(&pairs[0].scan, 0)?.ring.is_empty();
+    let model = options.model.or(Some(Model::Hdl64eS2).filter(|_| !has_rings));
+    let mut truth = TruthMaker::new(maps, model, extrinsics)?;
+    let mut pipelines: Vec<Option<(Pipeline, Mount)>> = options.variations.iter().map(|_| None).collect();
+    for (index, pair) in (0..).zip(pairs) {
+        let scan = read_scan(&pair.scan, index)?;
+        let classes = labels::read(&pair.labels, &pair.scan, scan.x.len())?;
+        let points = truth.points(&scan, &classes, index, &pair.scan)?;
+        for (variation, made) in options.variations.iter().zip(&mut pipelines) {
+            let row_name = variation.to_string();
+            let varied = variation.apply(&scan, extrinsics).with_context(|| pair.scan.display().to_string())?;
+            if let Some(folder) = &options.write_scans {
+                let name = pair.scan.file_stem().unwrap_or_default().to_string_lossy();
+                let truth = varied.original.iter().map(|index| {
+                    let index = *index as usize;
+                    (classes[index], points[index].map_or([Scored::Not; 2], |point| point.ground))
+                });
+                let folder = folder.join(&row_name);
+                let frame = WrittenFrame { folder: &folder, name: &name, path: &source.path, rows: &[&row_name] };
+                write(&frame, (&varied.scan, &varied.extrinsics), truth)?;
+            }
+            let (pipeline, mount) = match made {
+                Some(made) => made,
+                None => {
+                    // Chosen lasers are a sensor of their own, whose elevations follow from its rings.
+                    let model = model.filter(|_| !matches!(variation, Variation::Lasers(_)));
+                    made.insert(pipeline(maps, model, varied.extrinsics)?)
+                }
+            };
+            let place = |i: usize| [varied.scan.x[i], varied.scan.y[i], varied.scan.z[i]];
+            let kept = (0..varied.original.len()).filter(|i| Sweep::keeps(mount, place(*i)));
+            let kept: Vec<usize> = kept.map(|i| varied.original[i] as usize).collect();
+            let begun = Instant::now();
+            step(pipeline, varied.scan, index, &pair.scan)?;
+            let step_ms = begun.elapsed().as_secs_f64() * 1e3;
+            let sweep = pipeline.newest_sweep();
+            let points: Vec<JudgedPoint> = kept
+                .iter()
+                .zip(0..)
+                .map(|(original, i)| {
+                    let place = [sweep.x[i], sweep.y[i], sweep.z[i]];
+                    JudgedPoint { place, ..points[*original].unwrap_or(UNKNOWN) }
+                })
+                .collect();
+            let row = source.row(&row_name, variation.is_final_only());
+            row.judge_map(pipeline, &points);
+            row.step_ms.push(step_ms);
+            judged();
+        }
+    }
+    Ok(())
+}
+
+/// The truth about a point that the recorded scan's truth does not cover.
+const UNKNOWN: JudgedPoint =
+    JudgedPoint { place: [0.0; 3], class: "unlabeled", vote: Vote::Nothing, road: false, ground: [Scored::Not; 2] };
+
+/// Makes the truth of scans as they were recorded, with a pipeline that makes no map.
+struct TruthMaker {
+    pipeline: Pipeline,
+    mount: Mount,
+}
+
+impl TruthMaker {
+    fn new(maps: &MapsConfig, model: Option<Model>, extrinsics: Extrinsics) -> Result<Self> {
+        let (mut pipeline, mount) = pipeline(maps, model, extrinsics)?;
+        pipeline.set_active_layers(|_| false);
+        Ok(Self { pipeline, mount })
+    }
+
+    /// The truth of each point of the scan; `None` for points too near to be kept.
+    fn points(&mut self, scan: &Scan, classes: &[u32], index: u64, file: &Path) -> Result<Vec<Option<JudgedPoint>>> {
+        step(&mut self.pipeline, scan.clone(), index, file)?;
+        let keeps = |i: &usize| Sweep::keeps(&self.mount, [scan.x[*i], scan.y[*i], scan.z[*i]]);
+        let kept: Vec<usize> = (0..classes.len()).filter(keeps).collect();
+        let kept_classes: Vec<u32> = kept.iter().map(|i| classes[*i]).collect();
+        let mut points = vec![None; classes.len()];
+        for (i, point) in kept.into_iter().zip(labels::truth(self.pipeline.newest_sweep(), &kept_classes)) {
+            points[i] = Some(point);
+        }
+        Ok(points)
+    }
+}
+
+fn step(pipeline: &mut Pipeline, scan: Scan, sequence: u64, file: &Path) -> Result<()> {
+    let event = Event { sequence, arrival_ns: scan.stamp_ns, source: 0, body: Body::Scan(scan) };
+    pipeline.step(&event).with_context(|| file.display().to_string())?;
+    Ok(())
+}
+
+/// Checks KITTI's mount against the ground in the scans; returns the reason for using it, for the report.
+fn kitti_mount(folder: &Path, pairs: &[LabelledScan]) -> Result<String> {
+    let points = |scan: Scan| scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect();
+    let first = pairs.iter().zip(0..).take(MOUNT_SCANS).map(|(pair, index)| read_scan(&pair.scan, index).map(points));
+    let scans: Vec<Vec<[f32; 3]>> = first.collect::<Result<_>>()?;
+    let estimated = estimate(&scans).map_err(|error| anyhow!("{}: {error}; give --extrinsics", folder.display()))?;
+    let Extrinsics { z_m, pitch_deg, roll_deg, .. } = estimated.extrinsics();
+    if (z_m - KITTI_EXTRINSICS.z_m).abs() > MOUNT_M_OFF_MAX {
+        bail!(
+            "{}: the sensor is {z_m:.2} m above the ground, on KITTI's car {} m; give --extrinsics",
+            folder.display(),
+            KITTI_EXTRINSICS.z_m
+        );
+    }
+    Ok(format!(
+        "KITTI's car as published; estimated from the ground in {} scan(s): {z_m:.2} m, pitch {pitch_deg:.1}°, roll \
+         {roll_deg:.1}°",
+        scans.len()
+    ))
+}
+
+fn read_scan(file: &Path, index: u64) -> Result<Scan> {
+    match kitti::read(file, index)?.body {
+        Body::Scan(scan) => Ok(scan),
+        _ => unreachable!("the reading of a scan file is a scan"),
+    }
+}

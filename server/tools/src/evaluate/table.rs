@@ -1,0 +1,131 @@
+//! The result of an evaluation as tables.
+
+use std::fmt::Write as _;
+
+use super::report::{EvaluatedRow, EvaluatedSource, Evaluation, PROTOCOLS};
+use super::tally::{BANDS, BANDS_M, CellCount, Tally};
+
+/// Number of worlds that are listed for each layer, those with the most wrong cells first.
+const WORST: usize = 5;
+
+impl Evaluation {
+    /// The result as tables: one for each layer of each path.
+    pub fn to_text(&self) -> String {
+        let mut text = String::new();
+        // Writing into a string cannot fail.
+        for source in &self.sources {
+            let Some(first) = source.rows.first() else { continue };
+            let unlabelled = match source.unlabelled {
+                0 => String::new(),
+                scans => format!("; {scans} scan(s) without labels left out"),
+            };
+            let _ = writeln!(text, "{}: {} frame(s){unlabelled}", source.path, first.frames);
+            source.mounts.iter().for_each(|mount| _ = writeln!(text, "  extrinsics {mount}"));
+            write_layers(&mut text, source, first);
+            write_worst(&mut text, source);
+        }
+        let _ = writeln!(
+            text,
+            "A leak is a cell called drivable that has a point 0.3 to 2.5 m above the ground, or (simulated) ground \
+             that is too steep or cannot be reached; free is the share of cells called drivable that have no such \
+             point, reached or not. A false obstacle is a cell with ground and without such a point \
+             that is called occupied; pure ground has no other points. Not reached: drivable cells whose class means \
+             free ground without a way to it. Reach is the recall of all reachable ground; bands of range in metres \
+             from the vehicle. The layer ground is the shared estimate of the ground: a point within 0.2 m of it is \
+             called ground. F1 gr. and F1 veg: F1 of ground points by the two protocols below."
+        );
+        PROTOCOLS.iter().for_each(|(name, words)| _ = writeln!(text, "{name}: {words}."));
+        text
+    }
+}
+
+/// A table for each layer, with one line for each row; then the reach of the first row by class of ground.
+fn write_layers(text: &mut String, source: &EvaluatedSource, first: &EvaluatedRow) {
+    let width = source.rows.iter().map(|row| row.name.chars().count()).max().unwrap_or(0).max(26) + 1;
+    for (layer, first) in &first.layers {
+        let _ = writeln!(
+            text,
+            "  {:<width$} frames precision   free  reach     F1   road  false   pure not r.  F1 gr. F1 veg  {}  leaks",
+            format!("{layer}, %"),
+            bands(),
+        );
+        for row in &source.rows {
+            let Some(tally) = row.layer(layer) else { continue };
+            let [precision, free, reach, f1, road] =
+                [tally.precision(), tally.free_of_obstacles(), tally.recall(), tally.f1(), tally.road_recall()]
+                    .map(percent);
+            let [ground, pure, not_reached] =
+                [tally.ground, tally.pure_ground, tally.not_reached].map(|count| percent(count.share()));
+            let [excluded, low] = tally.points.map(|points| percent(points.f1()));
+            let name = format!("{}{}", row.name, if row.final_only { "*" } else { "" });
+            let _ = writeln!(
+                text,
+                "  {name:<width$} {:>6} {precision:>9} {free:>6} {reach:>6} {f1:>6} {road:>6} {ground:>6} {pure:>6} \
+                 {not_reached:>6}  {excluded:>6} {low:>6}  {}  {}",
+                row.frames,
+                by_band(&tally.by_range),
+                leaks(tally)
+            );
+        }
+        for (class, counts) in first.by_class.iter().filter(|_| first.by_class.len() > 1) {
+            let _ = writeln!(
+                text,
+                "  {:<offset$}  {}",
+                format!("  reach of {class}"),
+                by_band(counts),
+                offset = width + 81
+            );
+        }
+    }
+    for layer in &first.left_out {
+        let _ = writeln!(text, "  {layer}: left out, because none of its classes is free");
+    }
+    if source.rows.iter().any(|row| row.final_only) {
+        let _ = writeln!(text, "  * for final tables only: no parameter is tuned on these frames");
+    }
+    let times: Vec<String> =
+        source.rows.iter().filter_map(EvaluatedRow::step_ms_p50).map(|ms| format!("{ms:.1}")).collect();
+    if !times.is_empty() {
+        let _ = writeln!(text, "  all maps, milliseconds a frame (p50), by row: {}", times.join(", "));
+    }
+}
+
+/// The random worlds in which each layer has the most wrong cells.
+fn write_worst(text: &mut String, source: &EvaluatedSource) {
+    let Some(first) = source.rows.first().filter(|_| !source.worlds.is_empty()) else { return };
+    for (layer, _) in &first.layers {
+        let wrong =
+            |world: &super::report::EvaluatedWorld| world.row.layer(layer).map_or(0, |tally| tally.called_wrongly);
+        let mut worlds: Vec<_> = source.worlds.iter().filter(|world| wrong(world) > 0).collect();
+        worlds.sort_by_key(|world| (std::cmp::Reverse(wrong(world)), world.seed));
+        for world in worlds.into_iter().take(WORST) {
+            let tally = world.row.layer(layer).map(leaks).unwrap_or_default();
+            let (seed, name, description) = (world.seed, &world.name, &world.description);
+            let _ = writeln!(text, "  worst of {layer}: seed {seed} ({name}): {tally}: {description}");
+        }
+    }
+}
+
+fn leaks(tally: &Tally) -> String {
+    let by_class: Vec<String> = tally.leaks.iter().map(|(class, cells)| format!("{class} {cells}")).collect();
+    let by_class = if by_class.is_empty() { "none".to_owned() } else { by_class.join(", ") };
+    let by_range: Vec<String> = tally.wrong_by_range.iter().map(|count| count.of_them.to_string()).collect();
+    let by_range =
+        if tally.called_wrongly == 0 { String::new() } else { format!("; by range {}", by_range.join(", ")) };
+    format!("{} of {} drivable cells: {by_class}{by_range}", tally.called_wrongly, tally.called)
+}
+
+fn bands() -> String {
+    let names: Vec<String> =
+        BANDS_M.windows(2).map(|pair| format!("{:>6}", format!("{}-{}", pair[0], pair[1]))).collect();
+    names.join(" ")
+}
+
+fn by_band(counts: &[CellCount; BANDS]) -> String {
+    let shares: Vec<String> = counts.iter().map(|count| format!("{:>6}", percent(count.share()))).collect();
+    shares.join(" ")
+}
+
+fn percent(share: Option<f64>) -> String {
+    share.map_or("-".into(), |share| format!("{:.2}", 100.0 * share))
+}

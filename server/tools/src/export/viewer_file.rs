@@ -1,0 +1,205 @@
+//! A recording -> one MCAP file that viewers open without a plug-in.
+//!
+//! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`),
+//! `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf` (`foxglove.FrameTransforms`). ros2:
+//! `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`), `/clearway/<vehicle>/safe_path/markers`
+//! (`visualization_msgs/msg/MarkerArray`) and `.../poses` (`geometry_msgs/msg/PoseArray`),
+//! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
+//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording,
+//! and the stamp of the capture's or the scan's end.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use clearway_client::{Layer, MapView};
+use clearway_daemon::encode::viewer::raster::Rasters;
+use clearway_daemon::encode::viewer::{base_frame, foxglove as messages, ros, safe_paths};
+use clearway_ros::published::{
+    MARKER_ARRAY, OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, POSE_ARRAY, Published, TF_MESSAGE,
+};
+use foxglove::Encode;
+use foxglove::messages::FrameTransforms;
+use mcap::records::MessageHeader;
+
+use super::scans::{DecodedScan, ScanDecoder};
+use clearway_daemon::base::files;
+use clearway_journal::mcap_reader::{Header, Message};
+
+/// Kind of the messages in the file.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Dialect {
+    /// Foxglove's messages, encoded in protobuf.
+    Foxglove,
+    /// ROS 2 messages, encoded in CDR.
+    Ros2,
+}
+
+/// An MCAP file for viewers that is being written.
+pub struct ViewerFile {
+    dialect: Dialect,
+    writer: mcap::Writer<BufWriter<File>>,
+    /// The id of each topic's channel and the sequence number of its newest message, by topic.
+    channels: HashMap<String, (u16, u32)>,
+    rasters: BTreeMap<String, Rasters>,
+    /// Stamp of the newest map whose pose is written, by vehicle.
+    placed: HashMap<String, i64>,
+    /// `None` before the first event.
+    decoder: Option<ScanDecoder>,
+    with_points: bool,
+}
+
+impl ViewerFile {
+    /// Creates the file.
+    ///
+    /// # Errors
+    /// If the file exists or cannot be written.
+    pub fn create(file: &Path, dialect: Dialect, with_points: bool) -> Result<Self> {
+        let open = files::create_new(file)?;
+        let profile = if dialect == Dialect::Ros2 { "ros2" } else { "" };
+        let options = mcap::WriteOptions::new().profile(profile).compression_threads(0);
+        Ok(Self {
+            dialect,
+            writer: options.create(BufWriter::new(open))?,
+            channels: HashMap::new(),
+            rasters: BTreeMap::new(),
+            placed: HashMap::new(),
+            decoder: None,
+            with_points,
+        })
+    }
+
+    /// Writes the points of the scan that an event completes; `header` is that of the recording.
+    ///
+    /// # Errors
+    /// If the event or the header is wrong, or the file cannot be written.
+    pub fn write_event(&mut self, message: &Message, header: &Header) -> Result<()> {
+        let Some(vehicle) = message.journal_of().filter(|_| self.with_points) else { return Ok(()) };
+        let mut decoder = match self.decoder.take() {
+            Some(decoder) => decoder,
+            None => ScanDecoder::new(header)?,
+        };
+        if let Some(scan) = decoder.decode(vehicle, &message.data)? {
+            self.write_scan(vehicle, &scan, message.log_ns)?;
+        }
+        self.decoder = Some(decoder);
+        Ok(())
+    }
+
+    /// Writes a layer of a map, and the vehicle's pose if the map is new.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub fn write_map(&mut self, map: &MapView, layer: &Layer, log_ns: u64) -> Result<()> {
+        let (vehicle, name) = (map.vehicle(), &layer.name);
+        let mut rasters = self.rasters.remove(vehicle).unwrap_or_default();
+        let raster = rasters.of(layer);
+        match self.dialect {
+            Dialect::Foxglove => {
+                let grid = messages::grid(map, layer, raster);
+                self.write_foxglove(&format!("/{vehicle}/map/{name}"), &grid, log_ns)?;
+                if name == safe_paths::LAYER {
+                    let scene = messages::safe_paths(map, layer);
+                    self.write_foxglove(&format!("/{vehicle}/safe_points"), &scene, log_ns)?;
+                }
+            }
+            Dialect::Ros2 => {
+                let grid = ros::occupancy_grid(map, layer, raster);
+                let topic = format!("/clearway/{vehicle}/{name}");
+                self.write_ros(&topic, &OCCUPANCY_GRID, &grid, log_ns)?;
+                if name == safe_paths::LAYER {
+                    let (markers, poses) = (ros::safe_path_markers(map, layer), ros::safe_point_poses(map, layer));
+                    self.write_ros(&format!("{topic}/markers"), &MARKER_ARRAY, &markers, log_ns)?;
+                    self.write_ros(&format!("{topic}/poses"), &POSE_ARRAY, &poses, log_ns)?;
+                }
+            }
+        }
+        self.rasters.insert(vehicle.to_owned(), rasters);
+        // Each layer of a map is a message of its own, with the header of the map.
+        let stamp_ns = map.header().capture_end_ns;
+        let is_new = self.placed.insert(vehicle.to_owned(), stamp_ns) != Some(stamp_ns);
+        if is_new { self.write_pose(map, log_ns) } else { Ok(()) }
+    }
+
+    /// Writes the end of the file.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub fn finish(mut self) -> Result<()> {
+        self.writer.finish()?;
+        Ok(())
+    }
+
+    fn write_pose(&mut self, map: &MapView, log_ns: u64) -> Result<()> {
+        match self.dialect {
+            Dialect::Foxglove => match messages::transforms(map) {
+                Some(transforms) => self.write_foxglove("/tf", &transforms, log_ns),
+                None => Ok(()),
+            },
+            Dialect::Ros2 => {
+                let (Some(tf), Some(odometry)) = (ros::tf(map), ros::odometry(map)) else { return Ok(()) };
+                self.write_ros("/tf", &TF_MESSAGE, &tf, log_ns)?;
+                let topic = format!("/clearway/{}/odometry", map.vehicle());
+                self.write_ros(&topic, &ODOMETRY, &odometry, log_ns)
+            }
+        }
+    }
+
+    fn write_scan(&mut self, vehicle: &str, scan: &DecodedScan, log_ns: u64) -> Result<()> {
+        let frame = format!("{vehicle}/{}", scan.sensor);
+        let (stamp_ns, base, mount) = (scan.stamp_ns, base_frame(vehicle), scan.ego_from_sensor);
+        match self.dialect {
+            Dialect::Foxglove => {
+                let mount = messages::transform(stamp_ns, &base, &frame, mount);
+                self.write_foxglove("/tf", &FrameTransforms { transforms: vec![mount] }, log_ns)?;
+                let cloud = messages::points(stamp_ns, &frame, scan.points.iter().copied());
+                self.write_foxglove(&format!("/{vehicle}/points/{}", scan.sensor), &cloud, log_ns)
+            }
+            Dialect::Ros2 => {
+                self.write_ros("/tf", &TF_MESSAGE, &ros::transform(stamp_ns, &base, &frame, mount), log_ns)?;
+                let cloud = ros::points(stamp_ns, &frame, &scan.points);
+                let topic = format!("/clearway/{vehicle}/points/{}", scan.sensor);
+                self.write_ros(&topic, &POINT_CLOUD2, &cloud, log_ns)
+            }
+        }
+    }
+
+    fn write_foxglove<T: Encode>(&mut self, topic: &str, message: &T, log_ns: u64) -> Result<()> {
+        let mut bytes = Vec::new();
+        message.encode(&mut bytes).map_err(|error| anyhow::anyhow!("encode for {topic}: {error}"))?;
+        let schema = T::get_schema().context("a Foxglove message has a schema")?;
+        let schema = (schema.name.as_str(), schema.encoding.as_str(), &*schema.data);
+        self.write(topic, schema, &T::get_message_encoding(), log_ns, &bytes)
+    }
+
+    fn write_ros(&mut self, topic: &str, kind: &Published, message: &[u8], log_ns: u64) -> Result<()> {
+        self.write(topic, (&kind.name(), "ros2msg", kind.definition.as_bytes()), "cdr", log_ns, message)
+    }
+
+    fn write(
+        &mut self,
+        topic: &str,
+        (schema, schema_encoding, definition): (&str, &str, &[u8]),
+        encoding: &str,
+        log_time: u64,
+        message: &[u8],
+    ) -> Result<()> {
+        let (channel_id, sequence) = match self.channels.get_mut(topic) {
+            Some((channel, sequence)) => {
+                *sequence = sequence.wrapping_add(1);
+                (*channel, *sequence)
+            }
+            None => {
+                let schema = self.writer.add_schema(schema, schema_encoding, definition)?;
+                let channel = self.writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
+                self.channels.insert(topic.to_owned(), (channel, 0));
+                (channel, 0)
+            }
+        };
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+        self.writer.write_to_known_channel(&header, message)?;
+        Ok(())
+    }
+}

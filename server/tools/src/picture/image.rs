@@ -1,0 +1,115 @@
+//! The pixels of a picture: rectangles, text and other pictures in it, and the picture as a PNG.
+
+use clearway_daemon::encode::palette::Rgb;
+use font8x8::legacy::BASIC_LEGACY;
+
+/// Width and height of a letter, in dots.
+pub const LETTER: usize = 8;
+/// Space between two pictures, in pixels.
+const GAP: usize = 4;
+/// Dots of a character that the font does not have: a filled box.
+const BOX: [u8; LETTER] = [0xff; LETTER];
+
+/// A picture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Picture {
+    /// Width, in pixels.
+    pub width: usize,
+    /// Height, in pixels.
+    pub height: usize,
+    /// Red, green and blue of each pixel, row by row from the upper left.
+    pub rgb: Vec<Rgb>,
+    /// Text `Comment` of the PNG; `None` leaves it out.
+    pub comment: Option<String>,
+}
+
+impl Picture {
+    /// A picture of one colour.
+    pub fn new(width: usize, height: usize, colour: Rgb) -> Self {
+        Self { width, height, rgb: vec![colour; width * height], comment: None }
+    }
+
+    /// Encodes the picture as a PNG.
+    ///
+    /// # Errors
+    /// If it is larger than PNG allows.
+    pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
+        let mut file = Vec::new();
+        let mut encoder = png::Encoder::new(&mut file, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        if let Some(text) = &self.comment {
+            encoder.add_text_chunk("Comment".into(), text.clone())?;
+        }
+        let mut writer = encoder.write_header()?;
+        writer.write_image_data(self.rgb.as_flattened())?;
+        writer.finish()?;
+        Ok(file)
+    }
+
+    /// Fills a rectangle, as far as it lies in the picture.
+    pub fn fill(&mut self, (x, y): (usize, usize), (width, height): (usize, usize), colour: Rgb) {
+        let columns = x.min(self.width)..x.saturating_add(width).min(self.width);
+        for row in y..y.saturating_add(height).min(self.height) {
+            self.rgb[row * self.width..][columns.clone()].fill(colour);
+        }
+    }
+
+    /// Writes a line of text; `dot` is the edge of each dot of a letter, in pixels.
+    pub fn write(&mut self, (x, y): (usize, usize), dot: usize, text: &str, colour: Rgb) {
+        for (index, letter) in text.chars().enumerate() {
+            let rows = BASIC_LEGACY.get(letter as usize).unwrap_or(&BOX);
+            for (row, dots) in rows.iter().enumerate() {
+                for column in (0..LETTER).filter(|column| dots >> column & 1 == 1) {
+                    self.fill((x + (index * LETTER + column) * dot, y + row * dot), (dot, dot), colour);
+                }
+            }
+        }
+    }
+
+    /// Copies a picture into this one, which is large enough.
+    pub fn place(&mut self, (x, y): (usize, usize), picture: &Self) {
+        for (row, pixels) in picture.rgb.chunks(picture.width.max(1)).enumerate() {
+            self.rgb[(y + row) * self.width + x..][..picture.width].copy_from_slice(pixels);
+        }
+    }
+
+    /// Pictures side by side.
+    pub fn beside(pictures: &[Self]) -> Self {
+        let width = pictures.iter().map(|picture| picture.width + GAP).sum::<usize>().saturating_sub(GAP);
+        let height = pictures.iter().map(|picture| picture.height).max().unwrap_or(0);
+        let mut all = Self::new(width, height, [0; 3]);
+        let mut left = 0;
+        for picture in pictures {
+            all.place((left, 0), picture);
+            left += picture.width + GAP;
+        }
+        all
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_side_by_side_have_every_pixel_of_each() {
+        let [first, second] =
+            [(3, 2, 1), (5, 4, 2)].map(|(width, height, red)| Picture::new(width, height, [red, 0, 0]));
+        let both = Picture::beside(&[first, second]);
+        assert_eq!((both.width, both.height, both.rgb.len()), (3 + GAP + 5, 4, both.width * both.height));
+        let count = |red: u8| both.rgb.iter().filter(|pixel| pixel[0] == red).count();
+        assert_eq!([count(1), count(2)], [6, 20]);
+        assert_eq!((both.rgb[2][0], both.rgb[3 + GAP][0]), (1, 2));
+        assert_eq!(Picture::beside(&[]).rgb.len(), 0);
+    }
+
+    #[test]
+    fn what_is_drawn_beyond_the_edges_is_cut_off() {
+        let mut picture = Picture::new(10, 10, [0; 3]);
+        picture.fill((8, 8), (usize::MAX, 5), [1; 3]);
+        picture.write((6, 6), 2, "W", [2; 3]);
+        picture.fill((20, 20), (1, 1), [3; 3]);
+        assert!(picture.rgb.contains(&[2; 3]) && !picture.rgb.contains(&[3; 3]));
+    }
+}

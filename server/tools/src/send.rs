@@ -1,0 +1,226 @@
+//! A capture, or an MCAP file with VelodyneScan messages -> its datagrams, sent over UDP at the recorded pace, through a
+//! bad network if one is wanted.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fs::File;
+use std::io::BufReader;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Error, Result, bail};
+use clearway_daemon::base::files;
+use clearway_daemon::ingest::files::{Kind as FileKind, kind};
+use clearway_journal::mcap_reader::McapReader;
+use clearway_lidar::capture::Capture;
+use clearway_lidar::packet::PACKET_LENGTH;
+use clearway_lidar::telemetry::TELEMETRY_LENGTH;
+use clearway_ros::velodyne_scan::VelodyneScan;
+use clearway_sim::impair::{Counts, Faults, Impairment};
+use clearway_sim::send::{Sent, Until, drive};
+use clearway_sim::vehicle::{Datagram, Kind};
+
+pub use clearway_sim::send::Pace;
+
+/// Longest gap between two datagrams that is kept, in nanoseconds; a longer one becomes none.
+const GAP_NS_MAX: i64 = 60_000_000_000;
+
+/// What is sent, where to, and how.
+#[derive(Clone, Debug)]
+pub struct SendOptions {
+    /// The capture: pcap, pcapng, or MCAP with VelodyneScan messages.
+    pub file: PathBuf,
+    /// Target of the data packets.
+    pub to: SocketAddr,
+    /// Target of the telemetry.
+    pub telemetry_to: SocketAddr,
+    /// Address to send from.
+    pub own: SocketAddr,
+    /// Speed.
+    pub pace: Pace,
+    /// Faults of the network; `None`: a good one.
+    pub faults: Option<Faults>,
+}
+
+/// What was sent.
+#[derive(Clone, Debug)]
+pub struct SendSummary {
+    /// Number of datagrams.
+    pub sent: Sent,
+    /// Time from the first datagram to the last.
+    pub elapsed: Duration,
+    /// Number of datagrams and messages that were not sent, by reason.
+    pub skipped: BTreeMap<String, u64>,
+    /// Why the file is not whole; `None` if it is.
+    pub cut: Option<String>,
+    /// What the bad network did; `None` of a good one.
+    pub network: Option<Counts>,
+}
+
+/// Sends the datagrams of the file. `progress` is called with the bytes read.
+///
+/// # Errors
+/// If the file cannot be read or has no Velodyne datagram, or a datagram cannot be sent. A file that is cut off is not
+/// an error: the summary says so.
+pub fn send(options: &SendOptions, progress: impl FnMut(u64)) -> Result<SendSummary> {
+    let mut datagrams = RecordedDatagrams::open(&options.file, progress)?;
+    let mut network = options.faults.map(Impairment::new);
+    let began = Instant::now();
+    let send = |arriving: &mut dyn Iterator<Item = Datagram>| {
+        let (own, to, telemetry_to) = (options.own, options.to, options.telemetry_to);
+        drive(own, arriving, to, telemetry_to, options.pace, Until::default()).with_context(|| format!("send to {to}"))
+    };
+    let sent = match &mut network {
+        None => send(&mut datagrams)?,
+        Some(network) => send(&mut Arriving { sent: &mut datagrams, network, arrived: VecDeque::new() })?,
+    };
+    let elapsed = began.elapsed();
+    if let Some(error) = datagrams.error {
+        return Err(error);
+    }
+    if sent.packets + sent.telemetry == 0 {
+        bail!("{} has no Velodyne datagram", options.file.display());
+    }
+    let network = network.map(|network| network.counts());
+    Ok(SendSummary { sent, elapsed, skipped: datagrams.skipped, cut: datagrams.cut, network })
+}
+
+/// The datagrams of a file, with gaps of at most [`GAP_NS_MAX`]. They end at the first error.
+struct RecordedDatagrams<P> {
+    source: DatagramSource,
+    progress: P,
+    /// Datagrams that are read and not returned yet.
+    read: VecDeque<Datagram>,
+    skipped: BTreeMap<String, u64>,
+    cut: Option<String>,
+    error: Option<Error>,
+    /// Stamp of the newest datagram as recorded, and the sum of the gaps that were left out, in nanoseconds.
+    newest_ns: Option<i64>,
+    left_out_ns: i64,
+}
+
+enum DatagramSource {
+    Capture(Box<Capture<'static>>),
+    Mcap(Box<McapReader>),
+}
+
+impl<P: FnMut(u64)> RecordedDatagrams<P> {
+    fn open(file: &Path, progress: P) -> Result<Self> {
+        let (open, _) = files::open(file)?;
+        let source = match kind(file)? {
+            FileKind::Mcap => DatagramSource::Mcap(Box::new(McapReader::open(file)?)),
+            _ => {
+                let capture = Capture::new(BufReader::<File>::new(open));
+                DatagramSource::Capture(Box::new(capture.with_context(|| file.display().to_string())?))
+            }
+        };
+        Ok(Self {
+            source,
+            progress,
+            read: VecDeque::new(),
+            skipped: BTreeMap::new(),
+            cut: None,
+            error: None,
+            newest_ns: None,
+            left_out_ns: 0,
+        })
+    }
+
+    /// Reads the next datagram of the capture, or the next message; `false` at the end.
+    fn read_on(&mut self) -> Result<bool> {
+        match &mut self.source {
+            DatagramSource::Capture(capture) => {
+                let Some(datagram) = capture.next() else {
+                    let skipped = capture.skipped();
+                    for (reason, count) in [
+                        ("not UDP", skipped.not_udp),
+                        ("fragmented", skipped.fragmented),
+                        ("unreadable", skipped.unreadable),
+                    ] {
+                        self.skip(reason, count);
+                    }
+                    return Ok(false);
+                };
+                (self.progress)(capture.offset());
+                match datagram {
+                    Ok(datagram) => self.push(datagram.stamp_ns, &datagram.payload),
+                    Err(error) => self.cut = Some(error.to_string()),
+                }
+            }
+            DatagramSource::Mcap(recording) => {
+                let Some(message) = recording.next() else {
+                    self.cut = recording.incomplete();
+                    return Ok(false);
+                };
+                let message = message?;
+                (self.progress)(recording.bytes_read());
+                if !message.is_velodyne_scan() {
+                    self.skip("not a VelodyneScan", 1);
+                    return Ok(true);
+                }
+                let topic = || message.channel.topic.clone();
+                for packet in VelodyneScan::new(&message.data).with_context(topic)?.packets() {
+                    let (stamp_ns, packet) = packet.with_context(topic)?;
+                    self.push(stamp_ns, packet);
+                }
+            }
+        }
+        Ok(true)
+    }
+
+    fn push(&mut self, stamp_ns: i64, payload: &[u8]) {
+        let kind = match payload.len() {
+            PACKET_LENGTH => Kind::Data,
+            TELEMETRY_LENGTH => Kind::Telemetry,
+            length => {
+                return self.skip(&format!("{length} bytes; {PACKET_LENGTH} and {TELEMETRY_LENGTH} are sent"), 1);
+            }
+        };
+        let gap_ns = stamp_ns.saturating_sub(self.newest_ns.replace(stamp_ns).unwrap_or(stamp_ns));
+        self.left_out_ns += if gap_ns > GAP_NS_MAX { gap_ns } else { 0 };
+        self.read.push_back(Datagram { stamp_ns: stamp_ns - self.left_out_ns, kind, payload: payload.to_vec() });
+    }
+
+    fn skip(&mut self, reason: &str, count: u64) {
+        if count > 0 {
+            *self.skipped.entry(reason.to_owned()).or_default() += count;
+        }
+    }
+}
+
+impl<P: FnMut(u64)> Iterator for RecordedDatagrams<P> {
+    type Item = Datagram;
+
+    fn next(&mut self) -> Option<Datagram> {
+        while self.read.is_empty() && self.error.is_none() {
+            match self.read_on() {
+                Ok(true) => {}
+                Ok(false) => break,
+                Err(error) => self.error = Some(error),
+            }
+        }
+        self.read.pop_front()
+    }
+}
+
+/// What a network delivers of the datagrams that are sent into it.
+struct Arriving<'a, I> {
+    sent: &'a mut I,
+    network: &'a mut Impairment,
+    arrived: VecDeque<Datagram>,
+}
+
+impl<I: Iterator<Item = Datagram>> Iterator for Arriving<'_, I> {
+    type Item = Datagram;
+
+    fn next(&mut self) -> Option<Datagram> {
+        while self.arrived.is_empty() {
+            let Some(datagram) = self.sent.next() else {
+                self.arrived.extend(self.network.finish());
+                break;
+            };
+            self.arrived.extend(self.network.push(datagram));
+        }
+        self.arrived.pop_front()
+    }
+}
