@@ -172,11 +172,7 @@ fn a_file_that_cannot_be_used_is_named_with_what_to_do() {
     let (absent, here) = (at("absent.pcap"), folder.path().display().to_string());
     let (capture, recording, unknown) = (at("empty.pcap"), at("empty.mcap"), at("empty.bag"));
     let (to, png) = ("udp://127.0.0.1:9", at("out"));
-    let scan = at("scan.bin");
-    std::fs::write(&scan, [0; 16]).unwrap();
-    let clouds = ["replay", &scan, "--extrinsics", "0,0,1.9,0,0,0", "--clouds", &capture];
-    let wrong_files: [(&[&str], &str, &str); 20] = [
-        (&clouds, &capture, "this is a file; name a folder"),
+    let wrong_files: [(&[&str], &str, &str); 19] = [
         (&["info", &absent], &absent, no_file),
         (&["info", &here], &here, is_folder),
         (&["info", &capture], &capture, is_empty),
@@ -222,7 +218,7 @@ fn options_that_would_have_no_effect_are_refused() {
         (&["replay", &town, "--from", "100"], 2, "the replay plays 0.000 s to 0."),
         (&["replay", path, "--vehicle", "car"], 2, "--vehicle car: the files name no vehicle"),
         (&["replay", path, "--topic", "/points"], 2, "--topic /points: the files have no topics"),
-        (&["replay", path, "--record", path], 2, "this file is replayed; name another file"),
+        (&["replay", path, "--record", path], 2, "exists and is not overwritten; name another file"),
         (&["simulate", "flat", "--out", "x.pcap", "--telemetry-to", to], 3, "--telemetry-to"),
         (&["send", path, "--to", to, "--network", "seed=7"], 3, "a fault of the network is needed"),
         (&["watch", "--zenoh", "tcp/localhost:1", "--server", "localhost:1"], 3, "--server"),

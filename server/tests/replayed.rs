@@ -135,13 +135,3 @@ fn a_key_overrides_the_recorded_configuration_and_another_vehicle_is_refused() {
     assert_eq!(output.status.code(), Some(2));
     assert!(text(&output.stderr).contains("its vehicle is truck, but the recording has car"));
 }
-
-#[test]
-fn a_wrong_line_of_a_script_of_faults_is_named() {
-    let folder = tempfile::tempdir().unwrap();
-    let script = folder.path().join("faults.txt");
-    std::fs::write(&script, "loss:5\n\nfoo:1 # none\n").unwrap();
-    let output = clearway(&["replay", TOWN, "--fault-script", script.to_str().unwrap()]);
-    assert_eq!(output.status.code(), Some(2));
-    assert!(text(&output.stderr).contains("faults.txt, line 3: fault \"foo:1\""), "{}", text(&output.stderr));
-}

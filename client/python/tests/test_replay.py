@@ -77,7 +77,7 @@ def test_a_reader_over_zenoh_gets_the_maps_too(clearway_replay):
 
 
 def test_a_reader_over_zenoh_learns_why_a_replay_in_lockstep_has_failed(clearway_replay):
-    drive = clearway_replay(clearway.testing.TOWN, "--lockstep", "--lockstep-timeout", "0.5")
+    drive = clearway_replay(clearway.testing.TOWN, "--lockstep=0.5")
     with clearway.watch(drive.zenoh, vehicle="car", layers=["drivability"]) as maps:
         with pytest.raises(clearway.ClearwayError, match="map 0 of vehicle car was not acknowledged within 0.5 s"):
             while next(maps):

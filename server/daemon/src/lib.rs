@@ -12,7 +12,8 @@
 //! | [`fleet`] | announcements of other servers -> their vehicles, and where they are served |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file, and back; verification |
-//! | [`replay`] | recorded readings -> engines that are stepped in recorded time, and set back |
+//! | [`player`] | recorded readings -> engines that are stepped in recorded time, and set back |
+//! | [`replay`] | recorded files and options -> a server whose engines a player steps |
 //! | `store` | finished recordings -> a folder or a bucket, with an index; a search -> recordings |
 //! | [`status`] | ledger, rates and latency of each vehicle |
 //! | [`run`] | starts and stops all of these |
@@ -26,6 +27,7 @@ pub mod encode;
 pub mod engine;
 pub mod fleet;
 pub mod ingest;
+pub mod player;
 pub mod publish;
 pub mod record;
 pub mod replay;

@@ -13,7 +13,8 @@ mod recorder;
 #[cfg(feature = "store")]
 mod recordings;
 mod repair;
-pub mod replay;
+mod replay;
+mod replay_state;
 mod screen;
 mod serve;
 mod service_manager;
@@ -82,8 +83,8 @@ struct Arguments {
 #[derive(Subcommand)]
 enum Command {
     Serve(serve::Options),
-    Replay(Box<replay::Options>),
-    View(view::Options),
+    Replay(Box<replay::ReplayArguments>),
+    View(view::ViewArguments),
     Transport(transport::Options),
     Verify(verify::Options),
     Check(check::Options),

@@ -47,7 +47,7 @@ async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) 
     let mut hangups = signal(SignalKind::hangup())?;
     let setup = Setup { config: config.clone(), calibrations, certificates, held_sockets, ..Setup::default() };
     let running = Server::start(setup).await?;
-    log_endpoints(&running);
+    running.log_endpoints();
     service_manager::ready();
     tokio::pin!(stop);
     loop {
@@ -88,32 +88,4 @@ fn reload(running: &Running, configuration: &ConfigurationOptions, old: &Config)
         tracing::warn!("other keys than certificates, tokens, roles and limits have changed: they need a restart");
     }
     Ok(())
-}
-
-/// Logs every address at which the server listens, and the recording.
-pub fn log_endpoints(running: &Running) {
-    for vehicle in &running.inputs {
-        if let Some((data, telemetry)) = vehicle.udp {
-            tracing::info!(vehicle = %vehicle.name, %data, %telemetry, "listening for datagrams");
-        }
-    }
-    if let Some(at) = running.grpc {
-        tracing::info!(%at, "gRPC");
-    }
-    let tls = if running.is_encrypted() { "s" } else { "" };
-    if let Some(at) = running.page {
-        tracing::info!("page http{tls}://{at}/");
-    }
-    if let Some(at) = running.metrics {
-        tracing::info!("metrics http{tls}://{at}/metrics");
-    }
-    for endpoint in &running.zenoh {
-        tracing::info!(%endpoint, "zenoh");
-    }
-    if let Some(at) = running.foxglove {
-        tracing::info!("foxglove ws{tls}://{at}");
-    }
-    if let Some(recording) = running.recording() {
-        tracing::info!(%recording, "recording");
-    }
 }

@@ -6,10 +6,11 @@ use clearway_client::ClientError;
 use clearway_client::v1::{ReplayControl, ReplayState};
 
 use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::replay::options::offset;
-use crate::cli::replay::{Speed, state};
+use crate::cli::replay::offset;
+use crate::cli::replay_state as state;
 use crate::cli::shared::output::{block_on, print_line, usage_error};
-use clearway_daemon::replay::control::STEP_MAX;
+use clearway_daemon::player::control::STEP_MAX;
+use clearway_daemon::replay::ReplaySpeed;
 
 /// Control the replay of a server: pause, play, step, seek, range, rate, loop, lockstep.
 #[derive(Args)]
@@ -65,7 +66,7 @@ enum Request {
     /// Set the speed: 0.1 to 1000 times the recorded one, or max.
     Rate {
         /// A factor, or max.
-        rate: Speed,
+        rate: ReplaySpeed,
     },
     /// Begin again at the end, or do not.
     Loop {
@@ -73,7 +74,7 @@ enum Request {
         #[arg(value_parser = on_or_off, action = ArgAction::Set)]
         on: bool,
     },
-    /// Wait for the acknowledgement of each map, or do not; if none comes in the time of --lockstep-timeout, the server
+    /// Wait for the acknowledgement of each map, or do not; if none comes in the time of --lockstep, the server
     /// ends.
     Lockstep {
         /// on or off.

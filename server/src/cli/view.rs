@@ -1,40 +1,57 @@
 //! `clearway view`: recorded drives on the page, paused, to step through.
 
 use std::path::PathBuf;
+use std::process::Command;
 
 use anyhow::Result;
 use clap::Args;
+use clearway_daemon::replay::{ReplayOptions, ReplayRun, ServedReplay, describe};
 
-use crate::cli::replay;
+use crate::cli::replay::{offset, print_remarks};
 use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::{block_on, print_line, stop_signal};
 
 /// Look at recorded drives on the page: paused, with a time bar, a step and all layers.
 ///
-/// Replays the files as recorded on free ports of this machine, and prints the address of the page. The keys of
-/// `clearway replay` work too.
+/// Replays the files as recorded on free ports of this machine, and prints the address of the page. `clearway
+/// transport` works too.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway view drive.mcap
   clearway view drive.mcap --from 12.5 --open")]
-pub struct Options {
+pub struct ViewArguments {
     /// Recordings, captures, or folders of them, as of `clearway replay`.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Stand at this many seconds after the first event; the whole drive is in the time bar.
-    #[arg(long, value_name = "SECONDS", value_parser = replay::options::offset)]
+    #[arg(long, value_name = "SECONDS", value_parser = offset)]
     from: Option<f64>,
     /// Open the page with the browser of the desktop (xdg-open).
     #[arg(long)]
     open: bool,
 }
 
-/// Serves the page until a signal or the key q.
+/// Serves the page until a signal.
 ///
 /// # Errors
-/// [`replay::ReplayError`].
-pub fn run(options: Options) -> Result<Exit> {
-    let Options { files, from, open } = options;
-    let replayed =
-        replay::Options { files, seek: from, serve: true, any_port: true, paused: true, ..replay::Options::default() };
-    replay::view(replayed, open)
+/// [`ReplayError`](clearway_daemon::replay::ReplayError).
+pub fn run(arguments: ViewArguments) -> Result<Exit> {
+    let ViewArguments { files, from: seek_s, open } = arguments;
+    let served = ServedReplay { seek_s, any_port: true, paused: true, ..ServedReplay::default() };
+    let options = ReplayOptions { files, served: Some(served), ..ReplayOptions::default() };
+    let summary = block_on(async {
+        let stop = stop_signal()?;
+        let replay = ReplayRun::start(options).await?;
+        if let Some(description) = describe(replay.mount()) {
+            eprintln!("extrinsics {description}");
+        }
+        if let Some(page) = replay.running.page.map(|at| format!("http://{at}/")) {
+            print_line(&page)?;
+            if open && let Err(error) = Command::new("xdg-open").arg(&page).spawn() {
+                tracing::warn!(%error, "xdg-open");
+            }
+        }
+        Ok(replay.play(stop).await?)
+    })?;
+    Ok(Exit::from_incomplete(!print_remarks(&summary)))
 }

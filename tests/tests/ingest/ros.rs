@@ -4,9 +4,9 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
 use clearway_daemon::config::{Origin, Ros};
 use clearway_daemon::record::{run_config, verify};
+use clearway_daemon::replay::{Mount, ReplayError, ReplayOptions, ReplaySummary, replay};
 use clearway_lidar::model::Model;
 use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::config::Extrinsics;
@@ -108,12 +108,12 @@ fn drive() -> Vec<Message> {
     messages
 }
 
-async fn replayed(options: Options) -> Result<Summary, ReplayError> {
-    within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await
+async fn replayed(options: ReplayOptions) -> Result<ReplaySummary, ReplayError> {
+    within("replay", replay(options)).await
 }
 
-fn options(file: &Path) -> Options {
-    Options { files: vec![file.to_owned()], model: Some(Model::Hdl64eS2), ..Options::default() }
+fn options(file: &Path) -> ReplayOptions {
+    ReplayOptions { files: vec![file.to_owned()], model: Some(Model::Hdl64eS2), ..ReplayOptions::default() }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -123,7 +123,7 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_recorded_and_verified() {
     let messages = drive();
     let revolutions = messages.iter().filter(|(topic, ..)| *topic == "/odom").count() as u64;
     bag(&file, &messages);
-    let summary = replayed(Options { record: Some(record.clone()), ..options(&file) }).await.unwrap();
+    let summary = replayed(ReplayOptions { record: Some(record.clone()), ..options(&file) }).await.unwrap();
 
     let ledger = &summary.snapshot.ledger;
     assert!(revolutions >= 3);
@@ -175,7 +175,7 @@ async fn a_bag_of_several_sensors_makes_maps_of_all_that_tf_places() {
         messages.insert(at, ("/lost_points", CLOUD, stamp_ns + 500, cloud("nowhere", *stamp_ns, &data).to_cdr()));
     }
     bag(&file, &messages);
-    let summary = replayed(Options { record: Some(record.clone()), ..options(&file) }).await.unwrap();
+    let summary = replayed(ReplayOptions { record: Some(record.clone()), ..options(&file) }).await.unwrap();
     let (n, snapshot) = (revolutions.len() as u64, &summary.snapshot);
     let sensors = snapshot.sensors.iter().map(|sensor| (sensor.name.as_str(), sensor.ledger.decoded));
     let mut sensors: Vec<_> = sensors.collect();
@@ -242,7 +242,7 @@ async fn replay_reads_the_requested_topics_and_refuses_an_absent_one() {
     let file = folder.path().join("bag.mcap");
     bag(&file, &drive());
     let with_topics =
-        |topics: &[&str]| Options { topics: topics.iter().map(|&t| t.into()).collect(), ..options(&file) };
+        |topics: &[&str]| ReplayOptions { topics: topics.iter().map(|&t| t.into()).collect(), ..options(&file) };
     let summary = replayed(with_topics(&["/merged"])).await.unwrap();
     assert!(
         summary.notes.join("\n").contains("/merged is used; tf does not place its frame base_link 0.1 to 20 m"),
@@ -276,8 +276,9 @@ async fn tf_gives_poses_and_speed_without_odometry_in_a_bag_of_two_files() {
     bag(&files[0], first);
     bag(&files[1], second);
     let record = folder.path().join("maps.mcap");
-    let summary =
-        replayed(Options { files: files.to_vec(), record: Some(record.clone()), ..options(&files[0]) }).await.unwrap();
+    let summary = replayed(ReplayOptions { files: files.to_vec(), record: Some(record.clone()), ..options(&files[0]) })
+        .await
+        .unwrap();
     let ledger = &summary.snapshot.ledger;
     // The first transform has no speed, so it makes no pose.
     assert_eq!((ledger.poses, ledger.poses_refused), (stamps.len() as u64 - 1, 0));

@@ -6,10 +6,10 @@ use std::io::BufReader;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 
-use clearway::cli::replay::{Options, replay};
 use clearway_daemon::config::{Config, Sender, Udp};
 use clearway_daemon::ingest::queue::event_queue;
 use clearway_daemon::record::{run_config, verify};
+use clearway_daemon::replay::{ReplayOptions, replay};
 use clearway_daemon::run::Running;
 use clearway_daemon::status::{Format, prometheus};
 use clearway_journal::reader::{RecordedMessage, RecordingReader};
@@ -334,13 +334,13 @@ async fn two_captures_sent_to_one_port_make_the_maps_of_their_files() {
 
     for (vehicle, capture, _) in captures {
         let record = at(&format!("{vehicle}.mcap"));
-        let options = Options {
+        let options = ReplayOptions {
             files: vec![capture],
             record: Some(record.clone()),
             extrinsics: Some(extrinsics),
-            ..Options::default()
+            ..ReplayOptions::default()
         };
-        within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
+        within("replay", replay(options)).await.unwrap();
         let mut file: Vec<_> = recorded(&record).into_iter().collect();
         // The end of the file completes the last revolution; a socket has no end.
         let last = file.last().unwrap().0.0;

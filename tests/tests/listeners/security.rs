@@ -5,11 +5,10 @@ use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::sync::Arc;
 
-use clearway::cli::replay::{Options, Summary, replay};
 use clearway_client::{Client, ClientError, Observation, PublicKey, Subscription, Tls, ZenohClient, now_ns};
 use clearway_daemon::config::Only;
+use clearway_daemon::replay::{ReplayOptions, ReplayRun, ServedReplay};
 use clearway_daemon::run::{Running, Server, Setup};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -101,10 +100,11 @@ async fn replay_with_serve_requires_the_certificates_of_its_configuration() {
     let (file, scan) = (folder.path().join("clearway.toml"), folder.path().join("0.bin"));
     std::fs::write(&file, secured(true).to_toml()).unwrap();
     std::fs::write(&scan, [0; 16]).unwrap();
-    let (send_address, address) = tokio::sync::oneshot::channel();
-    let started = |running: &Running, _: &Summary| send_address.send(running.grpc).expect("the test listens");
+    let served = Some(ServedReplay::default());
+    let options = ReplayOptions { files: vec![scan], config: Some(file), served, ..ReplayOptions::default() };
+    let replay = ReplayRun::start(options).await.unwrap();
+    let address = replay.running.grpc.expect("gRPC is served").to_string();
     let requests = async {
-        let address = address.await.expect("it starts").expect("gRPC is served").to_string();
         let plain = async { Client::connect(&address).await?.vehicles().await }.await;
         assert!(plain.is_err(), "{plain:?}");
         for (name, may_ask) in [("reader", true), ("server", false)] {
@@ -112,8 +112,7 @@ async fn replay_with_serve_requires_the_certificates_of_its_configuration() {
             assert_eq!(client.vehicles().await.is_ok(), may_ask, "{name}");
         }
     };
-    let options = Options { files: vec![scan], config: Some(file), serve: true, ..Options::default() };
-    within("a replay", replay(options, Arc::default(), started, requests)).await.unwrap();
+    within("a replay", replay.play(requests)).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

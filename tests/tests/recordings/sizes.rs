@@ -7,10 +7,10 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use clearway::cli::replay::{Options, replay};
 use clearway_daemon::config::Config;
 use clearway_daemon::ingest::observation;
 use clearway_daemon::record::run_config;
+use clearway_daemon::replay::{ReplayOptions, replay};
 use clearway_journal::encode::EncodedMap;
 use clearway_journal::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::MapsConfig;
@@ -70,8 +70,8 @@ impl Sized {
 async fn maps(drive: &Drive) -> Vec<Sized> {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (Path::new(env!("CLEARWAY_DRIVES")).join(drive.path), folder.path().join("drive.mcap"));
-    let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
-    fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
+    let options = ReplayOptions { files: vec![file.clone()], record: Some(record.clone()), ..ReplayOptions::default() };
+    fixture::within("replay", replay(options)).await.unwrap();
     let mut recording = RecordingReader::open(&record).unwrap();
     let (config, tables) = run_config(&recording).unwrap();
     // Time by which the arrivals are ahead of the sensor's clock: the poses have stamps of that clock.

@@ -4,8 +4,8 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use clearway::cli::replay::{Options, replay};
 use clearway_daemon::record::verify;
+use clearway_daemon::replay::{ReplayOptions, replay};
 use clearway_lidar::model::Model;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
@@ -63,10 +63,11 @@ fn live_maps_of_four_vehicles_are_those_of_ten_replays_on_one_two_and_four_threa
     for run in 0..REPLAYS {
         let threads = [1, 2, 4][run % 3];
         let options =
-            Options { files: vec![live.clone()], record: Some(again.clone()), force: true, ..Options::default() };
-        let replayed = replay(options, Default::default(), |_, _| {}, std::future::pending());
+            ReplayOptions { files: vec![live.clone()], record: Some(again.clone()), ..ReplayOptions::default() };
+        let replayed = replay(options);
         runtime(threads).block_on(within("replay", replayed)).unwrap();
         let difference = maps.first_difference(&Digests::of(&again).unwrap());
+        std::fs::remove_file(&again).unwrap();
         assert_eq!(difference, None, "run {run} on {threads} threads");
     }
     let report = verify(&live).unwrap();

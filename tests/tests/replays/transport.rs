@@ -2,15 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use clearway::cli::replay::{Options, ReplayError, Summary, replay};
 use clearway_client::{Client, ClientError, MapStream, MapView, StreamEvent, Subscription};
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::record::verify;
-use clearway_daemon::run::Running;
+use clearway_daemon::replay::{ReplayError, ReplayOptions, ReplayRun, ReplaySummary, ServedReplay};
 use clearway_journal::encode::as_served;
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
@@ -50,33 +48,48 @@ async fn recorded_drive_of(vehicle: &str, folder: &Path, tenths: i64) -> PathBuf
     file
 }
 
-/// Options of a replay for tests: no other program's ports.
-fn served(file: &Path) -> Options {
-    Options { files: vec![file.to_owned()], serve: true, any_port: true, ..Options::default() }
+/// ReplayOptions of a replay for tests: no other program's ports.
+fn served(file: &Path, served: ServedReplay) -> ReplayOptions {
+    let served = Some(ServedReplay { any_port: true, ..served });
+    ReplayOptions { files: vec![file.to_owned()], served, ..ReplayOptions::default() }
+}
+
+/// A replay that waits for one reader, and ends at its end.
+fn for_one_reader() -> ServedReplay {
+    ServedReplay { exits_at_end: true, wait_readers: 1, ..ServedReplay::default() }
+}
+
+/// A replay of one reader that has to acknowledge each map in this time.
+fn in_lockstep(file: &Path, seconds: f64) -> ReplayOptions {
+    let lockstep = Some(Duration::from_secs_f64(seconds));
+    served(file, ServedReplay { lockstep, ..for_one_reader() })
+}
+
+/// A replay that begins paused.
+fn paused() -> ServedReplay {
+    ServedReplay { paused: true, ..ServedReplay::default() }
 }
 
 /// Replays, and runs `test` with the address of gRPC meanwhile; the replay ends when both have.
 async fn replayed<F: Future<Output = T>, T>(
-    options: Options,
+    options: ReplayOptions,
     test: impl FnOnce(String) -> F,
-) -> (Result<Summary, ReplayError>, Option<T>) {
-    let (send_address, address) = tokio::sync::oneshot::channel();
-    let started = |running: &Running, _: &Summary| {
-        // Without --serve there is no address, and the test needs none.
-        let address = running.grpc.map(|address| address.to_string()).unwrap_or_default();
-        send_address.send(address).expect("the test listens");
+) -> (Result<ReplaySummary, ReplayError>, Option<T>) {
+    let ends_itself = options.served.as_ref().is_none_or(|of| of.exits_at_end || of.lockstep.is_some());
+    let replay = match ReplayRun::start(options).await {
+        Ok(replay) => replay,
+        Err(error) => return (Err(error), None),
     };
-    let ends_itself = !options.serve || options.exit_at_end || options.lockstep;
+    // A replay that is not served has no address, and the test needs none.
+    let address = replay.running.grpc.map(|address| address.to_string()).unwrap_or_default();
     let mut outcome = None;
     let stop = async {
-        if let Ok(address) = address.await {
-            outcome = Some(test(address).await);
-        }
+        outcome = Some(test(address).await);
         if ends_itself {
             std::future::pending::<()>().await;
         }
     };
-    let summary = within("a replay", replay(options, Arc::default(), started, stop)).await;
+    let summary = within("a replay", replay.play(stop)).await;
     (summary, outcome)
 }
 
@@ -107,16 +120,10 @@ async fn maps_as_live_are_the_recorded_ones_moved_by_one_constant_until_the_end(
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 12).await;
     let (ready, again) = (folder.path().join("ready.json"), folder.path().join("again.mcap"));
-    // As a replay that was killed has left it: no process has this number.
-    std::fs::write(&ready, r#"{"pid":4194305,"grpc":0,"page":0,"zenoh":[],"foxglove":0,"vehicles":[]}"#).unwrap();
-    let options = Options {
-        as_live: true,
-        exit_at_end: true,
-        wait_readers: Some(1),
-        ready_file: Some(ready.clone()),
-        record: Some(again.clone()),
-        ..served(&drive)
-    };
+    // As mktemp makes it.
+    std::fs::write(&ready, "").unwrap();
+    let as_live = ServedReplay { as_live: true, ready_file: Some(ready.clone()), ..for_one_reader() };
+    let options = ReplayOptions { record: Some(again.clone()), ..served(&drive, as_live) };
     let test = async |address: String| {
         let file: serde_json::Value = serde_json::from_slice(&std::fs::read(&ready).unwrap()).unwrap();
         assert_eq!((file["grpc"].as_str(), file["pid"].as_u64()), (Some(&*address), Some(std::process::id().into())));
@@ -184,7 +191,7 @@ async fn a_seek_to_any_of_a_hundred_moments_gives_the_map_of_the_straight_run() 
             assert!(refused.message().contains(text), "{refused}");
         }
     };
-    let (summary, tested) = replayed(Options { paused: true, ..served(&drive) }, test).await;
+    let (summary, tested) = replayed(served(&drive, paused()), test).await;
     assert!(tested.is_some());
     assert!(!summary.unwrap().reached_end, "it was stopped");
 }
@@ -252,7 +259,7 @@ async fn a_step_makes_so_many_maps_and_a_range_ends_and_begins_again() {
         }
         (sequences, first_end)
     };
-    let (summary, outcome) = replayed(Options { paused: true, ..served(&drive) }, test).await;
+    let (summary, outcome) = replayed(served(&drive, paused()), test).await;
     assert_eq!(outcome.unwrap(), (vec![0, 2], 5));
     summary.unwrap();
 }
@@ -262,7 +269,7 @@ async fn in_lockstep_a_reader_gets_every_map_and_one_that_never_acknowledges_is_
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 8).await;
     let maps = recorded_maps(&drive).len();
-    let options = Options { lockstep: true, exit_at_end: true, wait_readers: Some(1), ..served(&drive) };
+    let options = in_lockstep(&drive, 10.0);
     async fn reads(address: String, acknowledges: bool) -> (Vec<u64>, String) {
         let mut service = v1::map_service_client::MapServiceClient::connect(format!("http://{address}")).await.unwrap();
         let (requests, stream) = tokio::sync::mpsc::channel(8);
@@ -288,7 +295,7 @@ async fn in_lockstep_a_reader_gets_every_map_and_one_that_never_acknowledges_is_
     assert!(summary.unwrap().reached_end);
     assert_eq!(read.unwrap(), ((0..maps as u64).collect(), String::new()));
 
-    let options = Options { lockstep_timeout: Some(0.2), ..options };
+    let options = in_lockstep(&drive, 0.2);
     // The reader outlives the replay.
     let (send_read, read) = tokio::sync::oneshot::channel();
     let test = async move |address| drop(tokio::spawn(async move { send_read.send(reads(address, false).await) }));
@@ -329,7 +336,7 @@ async fn while_a_step_waits_for_an_acknowledgement_the_state_says_so_and_a_seek_
         assert_eq!((&*state.awaited, &state.maps[..]), ("", &[4][..]));
         assert_eq!(stepped.await.unwrap().jumps, 1, "the step is over when the seek is made");
     };
-    let (summary, tested) = replayed(Options { paused: true, ..served(&drive) }, test).await;
+    let (summary, tested) = replayed(served(&drive, paused()), test).await;
     tested.expect("the test ran");
     summary.unwrap();
 }
@@ -354,7 +361,7 @@ async fn a_drive_opened_at_a_moment_stands_there_between_its_whole_begin_and_end
         let error = client.newest("", &[]).await.unwrap_err().to_string();
         assert!(error.contains("has no map yet"), "before the first map there is no newest one: {error}");
     };
-    let (summary, tested) = replayed(Options { paused: true, seek: Some(0.4), ..served(&drive) }, test).await;
+    let (summary, tested) = replayed(served(&drive, ServedReplay { seek_s: Some(0.4), ..paused() }), test).await;
     tested.expect("the test ran");
     summary.unwrap();
 }
@@ -364,7 +371,7 @@ async fn in_lockstep_the_next_map_is_made_when_the_client_has_handled_the_last()
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 8).await;
     let maps = recorded_maps(&drive).len() as u64;
-    let options = Options { lockstep: true, exit_at_end: true, wait_readers: Some(1), ..served(&drive) };
+    let options = in_lockstep(&drive, 10.0);
     let (summary, sequences) = replayed(options.clone(), async |address| {
         let client = Client::connect(&address).await.unwrap();
         let mut stream = client.subscribe(Subscription::default()).await.unwrap();
@@ -378,7 +385,7 @@ async fn in_lockstep_the_next_map_is_made_when_the_client_has_handled_the_last()
     assert!(summary.unwrap().reached_end);
     assert_eq!(sequences.unwrap(), (0..maps).collect::<Vec<_>>());
     // A client that never asks for the next map still handles the first, although it has arrived.
-    let options = Options { lockstep_timeout: Some(0.2), ..options };
+    let options = in_lockstep(&drive, 0.2);
     let (summary, _) = replayed(options, async |address| {
         let client = Client::connect(&address).await.unwrap();
         let mut stream = client.subscribe(Subscription::default()).await.unwrap();
@@ -397,19 +404,20 @@ async fn in_lockstep_the_next_map_is_made_when_the_client_has_handled_the_last()
 async fn recorded_stamps_are_stale_by_the_wall_clock_and_fresh_by_the_replays() {
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 8).await;
-    let (summary, _) = replayed(Options { wait_readers: Some(1), ..served(&drive) }, async |address| {
-        let client = Client::connect(&address).await.unwrap();
-        let by_replay = Subscription { replay_clock: true, ..Subscription::default() };
-        let mut by_replay = client.subscribe(by_replay).await.unwrap();
-        let StreamEvent::Fresh(update) = by_replay.next_or_stale().await.unwrap() else { panic!("it is fresh") };
-        assert!(!update.map.is_stale(update.map.now_ns()) && update.map.is_stale(clearway_client::now_ns()));
-        let mut by_wall = client.subscribe(Subscription::default()).await.unwrap();
-        assert!(matches!(by_wall.next_or_stale().await.unwrap(), StreamEvent::Stale(_)));
-        // After the last map they are stale by both.
-        while by_replay.next().await.is_ok() {}
-        while !matches!(by_replay.next_or_stale().await.unwrap(), StreamEvent::Stale(_)) {}
-    })
-    .await;
+    let (summary, _) =
+        replayed(served(&drive, ServedReplay { wait_readers: 1, ..ServedReplay::default() }), async |address| {
+            let client = Client::connect(&address).await.unwrap();
+            let by_replay = Subscription { replay_clock: true, ..Subscription::default() };
+            let mut by_replay = client.subscribe(by_replay).await.unwrap();
+            let StreamEvent::Fresh(update) = by_replay.next_or_stale().await.unwrap() else { panic!("it is fresh") };
+            assert!(!update.map.is_stale(update.map.now_ns()) && update.map.is_stale(clearway_client::now_ns()));
+            let mut by_wall = client.subscribe(Subscription::default()).await.unwrap();
+            assert!(matches!(by_wall.next_or_stale().await.unwrap(), StreamEvent::Stale(_)));
+            // After the last map they are stale by both.
+            while by_replay.next().await.is_ok() {}
+            while !matches!(by_replay.next_or_stale().await.unwrap(), StreamEvent::Stale(_)) {}
+        })
+        .await;
     summary.unwrap();
 }
 
@@ -417,11 +425,11 @@ async fn recorded_stamps_are_stale_by_the_wall_clock_and_fresh_by_the_replays() 
 async fn a_range_outside_the_files_is_refused_and_a_stopped_replay_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 5).await;
-    let outside = Options { from: Some(99.0), files: vec![drive.clone()], ..Options::default() };
+    let outside = ReplayOptions { from_s: Some(99.0), files: vec![drive.clone()], ..ReplayOptions::default() };
     let (error, _) = replayed(outside, async |_| {}).await;
     let error = error.unwrap_err().to_string();
     assert!(error.starts_with("--from 99.000 s: the replay plays 0.000 s to 0.5"), "{error}");
-    let waits = Options { wait_readers: Some(2), ..served(&drive) };
+    let waits = served(&drive, ServedReplay { wait_readers: 2, ..ServedReplay::default() });
     let (summary, _) = replayed(waits, async |_| tokio::time::sleep(Duration::ZERO).await).await;
     let summary = summary.unwrap();
     assert!(!summary.reached_end && summary.snapshot.maps == 0);
@@ -434,7 +442,8 @@ async fn recordings_of_two_vehicles_run_in_one_time() {
     let (car, van) =
         (recorded_drive_of("car", folder.path(), 6).await, recorded_drive_of("van", folder.path(), 4).await);
     let both = folder.path().join("both.mcap");
-    let options = Options { files: vec![car.clone(), van.clone()], record: Some(both.clone()), ..Options::default() };
+    let options =
+        ReplayOptions { files: vec![car.clone(), van.clone()], record: Some(both.clone()), ..ReplayOptions::default() };
     let (summary, _) = replayed(options, async |_| {}).await;
     let summary = summary.unwrap();
     let text = summary.to_text();
@@ -444,7 +453,7 @@ async fn recordings_of_two_vehicles_run_in_one_time() {
     assert!(report.is_good(), "{:?}", report.differences);
     assert_eq!(report.maps as usize, recorded_maps(&car).len() + recorded_maps(&van).len());
     // One of them is replayed as ever.
-    let options = Options { files: vec![both], vehicle: Some("van".into()), ..Options::default() };
+    let options = ReplayOptions { files: vec![both], vehicle: Some("van".into()), ..ReplayOptions::default() };
     let (summary, _) = replayed(options, async |_| {}).await;
     assert_eq!(summary.unwrap().snapshot.maps as usize, recorded_maps(&van).len());
 }
@@ -453,18 +462,15 @@ async fn recordings_of_two_vehicles_run_in_one_time() {
 async fn the_same_faults_give_the_same_maps_and_are_counted() {
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 10).await;
-    let script = folder.path().join("faults.txt");
-    std::fs::write(&script, "# a window of the sensor\nlost:top@0.4-0.65\n\nloss:5 # percent\npose:1,0,5@0.5\n")
-        .unwrap();
+    let faults = ["lost:top@0.4-0.65", "loss:5", "pose:1,0,5@0.5"].map(|fault| fault.parse().unwrap());
     let mut runs = Vec::new();
     for name in ["a.mcap", "b.mcap"] {
         let record = folder.path().join(name);
-        let options = Options {
+        let options = ReplayOptions {
             files: vec![drive.clone()],
             record: Some(record.clone()),
-            fault_script: Some(script.clone()),
-            fault_seed: Some(7),
-            ..Options::default()
+            faults: faults.to_vec(),
+            ..ReplayOptions::default()
         };
         let (summary, _) = replayed(options, async |_| {}).await;
         let notes = summary.unwrap().notes;
@@ -474,9 +480,13 @@ async fn the_same_faults_give_the_same_maps_and_are_counted() {
         assert!(report.is_good(), "{:?}", report.differences);
         runs.push(fixture::recorded(&record));
     }
-    assert!(runs[0] == runs[1], "the seed repeats the faults");
+    assert!(runs[0] == runs[1], "the faults are repeated");
     assert!(runs[0].len() < fixture::recorded(&drive).len(), "the lost sensor makes no maps");
-    let unknown = Options { files: vec![drive], faults: vec!["lost:front@1-2".parse().unwrap()], ..Options::default() };
+    let unknown = ReplayOptions {
+        files: vec![drive],
+        faults: vec!["lost:front@1-2".parse().unwrap()],
+        ..ReplayOptions::default()
+    };
     let (error, _) = replayed(unknown, async |_| {}).await;
     assert!(error.unwrap_err().to_string().contains("sensor \"front\" is not known; known: top"));
 }
@@ -485,14 +495,14 @@ async fn the_same_faults_give_the_same_maps_and_are_counted() {
 async fn overlapping_files_and_a_configuration_of_other_sensors_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let drive = recorded_drive(folder.path(), 3).await;
-    let twice = Options { files: vec![drive.clone(), drive.clone()], ..Options::default() };
+    let twice = ReplayOptions { files: vec![drive.clone(), drive.clone()], ..ReplayOptions::default() };
     let (error, _) = replayed(twice, async |_| {}).await;
     let error = error.unwrap_err().to_string();
     assert!(error.contains("car.mcap: it begins 0.") && error.contains("without overlap"), "{error}");
     let (file, mut config) = (folder.path().join("other.toml"), fixture::config());
     config.vehicles[0].sensors[0].name = "front".into();
     std::fs::write(&file, config.to_toml()).unwrap();
-    let other = Options { files: vec![drive], config: Some(file), ..Options::default() };
+    let other = ReplayOptions { files: vec![drive], config: Some(file), ..ReplayOptions::default() };
     let (error, _) = replayed(other, async |_| {}).await;
     let error = error.unwrap_err().to_string();
     assert!(error.contains("vehicle car has the sensors [front], but the recording has [top]"), "{error}");

@@ -77,7 +77,7 @@ async fn a_reader_over_zenoh_learns_that_a_replay_has_ended_and_why_one_in_locks
     }
     assert!(matches!(late.next().await, Err(ClientError::ReplayEnded { .. })));
 
-    let drive = Replay::with(town(), &["--lockstep", "--lockstep-timeout", "0.5"]).unwrap();
+    let drive = Replay::with(town(), &["--lockstep=0.5"]).unwrap();
     let client = ZenohClient::connect(&drive.zenoh).await.unwrap();
     let mut maps = client.subscribe("car", "drivability").await.unwrap();
     let failed = loop {

@@ -20,8 +20,8 @@ use super::page_live::{Live, MESSAGE_BYTES_MAX};
 use super::page_recorder::PageRecorder;
 use super::served::Vehicles;
 use crate::fleet::Fleet;
+use crate::player::ReplayHandle;
 use crate::record::writer::RecorderControl;
-use crate::replay::ReplayHandle;
 use crate::status::{Format, prometheus, vehicle_json};
 
 #[derive(RustEmbed)]

@@ -46,7 +46,7 @@ use super::page_replay::{PageReplay, PageRequest, replay_answered, replay_change
 use super::served::{Served, Vehicles};
 use crate::base::sync::locked;
 use crate::fleet::Fleet;
-use crate::replay::ReplayHandle;
+use crate::player::ReplayHandle;
 use crate::status::vehicle_json;
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.

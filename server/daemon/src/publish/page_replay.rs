@@ -14,7 +14,7 @@ use serde_json::json;
 use tokio::sync::watch;
 
 use super::listen::access::Caller;
-use crate::replay::ReplayHandle;
+use crate::player::ReplayHandle;
 
 /// The replay as one page reaches it.
 pub(super) struct PageReplay {
@@ -123,7 +123,7 @@ impl PageRequest {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::replay::control::Command;
+    use crate::player::control::Command;
 
     #[tokio::test]
     async fn a_step_that_waits_holds_up_no_request_after_it() {

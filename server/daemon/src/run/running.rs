@@ -19,11 +19,11 @@ use crate::engine::subscriptions::LayerSubscription;
 use crate::fleet::Fleet;
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::udp;
+use crate::player::ReplayHandle;
 use crate::publish::Vehicles;
 use crate::publish::listen::ListenerHandle;
 use crate::publish::listen::security::{Current, Security};
 use crate::record::writer::Recorder;
-use crate::replay::ReplayHandle;
 use crate::traces::Traces;
 
 /// Longest time of [`Running::shutdown_in_time`]. Ours: service managers wait 10 s or more before they kill a server.
@@ -75,15 +75,38 @@ pub struct Running {
 }
 
 impl Running {
+    /// Logs every address at which the server listens, and the recording.
+    pub fn log_endpoints(&self) {
+        for vehicle in &self.inputs {
+            if let Some((data, telemetry)) = vehicle.udp {
+                tracing::info!(vehicle = %vehicle.name, %data, %telemetry, "listening for datagrams");
+            }
+        }
+        if let Some(at) = self.grpc {
+            tracing::info!(%at, "gRPC");
+        }
+        let tls = if self.is_encrypted() { "s" } else { "" };
+        if let Some(at) = self.page {
+            tracing::info!("page http{tls}://{at}/");
+        }
+        if let Some(at) = self.metrics {
+            tracing::info!("metrics http{tls}://{at}/metrics");
+        }
+        for endpoint in &self.zenoh {
+            tracing::info!(%endpoint, "zenoh");
+        }
+        if let Some(at) = self.foxglove {
+            tracing::info!("foxglove ws{tls}://{at}");
+        }
+        if let Some(recording) = self.recording() {
+            tracing::info!(%recording, "recording");
+        }
+    }
+
     /// The path of the recording, if the server records and the disk has answered.
     pub fn recording(&self) -> Option<String> {
         let file = self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file);
         file.filter(|file| !file.is_empty())
-    }
-
-    /// Controls the replay that the server serves, if it serves one.
-    pub fn replay(&self) -> Option<ReplayHandle> {
-        self.replay.clone()
     }
 
     /// What of the vehicles has stopped or hangs, as `/healthz` says it; `None` if nothing has.

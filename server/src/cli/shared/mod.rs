@@ -15,4 +15,3 @@ pub(super) mod model;
 pub(super) mod output;
 
 pub(super) use clearway_daemon::base::files;
-pub(super) use clearway_daemon::ingest::files::ground_revolutions;

@@ -1,6 +1,9 @@
 //! What the subcommands share to run and to print: stdout, the progress bar, the runtime, the signals that end them.
 
 use std::io::{ErrorKind, Write};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use anyhow::{Context, Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -58,6 +61,34 @@ pub fn usage_error(message: impl std::fmt::Display) -> Error {
 pub fn progress_bar(length: u64) -> ProgressBar {
     let style = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg}").expect("the template is a constant");
     ProgressBar::new(length).with_style(style)
+}
+
+/// A progress bar of the bytes of a replay, which is cleared when this is dropped.
+pub struct DrawnProgress {
+    bar: ProgressBar,
+    task: tokio::task::JoinHandle<()>,
+}
+
+impl Drop for DrawnProgress {
+    fn drop(&mut self) {
+        self.task.abort();
+        self.bar.finish_and_clear();
+    }
+}
+
+/// Draws a progress bar of `bytes` on stderr in a task, ten times a second.
+pub fn draw_progress(bytes: u64, bytes_read: Arc<AtomicU64>) -> DrawnProgress {
+    let template = "{bar:40} {bytes}/{total_bytes} {bytes_per_sec} {eta}";
+    let style = ProgressStyle::with_template(template).expect("the template is a constant");
+    let bar = ProgressBar::new(bytes).with_style(style);
+    let drawn = bar.clone();
+    let task = tokio::spawn(async move {
+        loop {
+            drawn.set_position(bytes_read.load(Ordering::Relaxed));
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    });
+    DrawnProgress { bar, task }
 }
 
 /// Runs `work` to its end on a runtime of several threads.

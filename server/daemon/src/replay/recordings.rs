@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::options::{Options, ReplayError};
-use clearway_daemon::config::{Calibrations, Config, Vehicle};
-use clearway_daemon::ingest::files::{Kind, Readings};
-use clearway_daemon::record::run_config;
+use super::error::ReplayError;
+use super::options::ReplayOptions;
+use crate::config::{Calibrations, Config, Vehicle};
+use crate::ingest::files::{Kind, Readings};
+use crate::record::run_config;
 use clearway_journal::reader::RecordingReader;
 
 /// A recording of this server.
@@ -41,7 +42,7 @@ pub(super) fn several_vehicles(files: &Readings) -> Result<Option<Vec<Recorded>>
 
 /// The recordings of the vehicle that the options name, if some of the files are of other vehicles only; the log names
 /// those.
-pub(super) fn files_of_vehicle(options: &Options, files: &Readings) -> Result<Option<Vec<PathBuf>>, ReplayError> {
+pub(super) fn files_of_vehicle(options: &ReplayOptions, files: &Readings) -> Result<Option<Vec<PathBuf>>, ReplayError> {
     let Some(name) = options.vehicle.as_ref().filter(|_| options.config.is_none()) else { return Ok(None) };
     let recordings = several_vehicles(files)?.unwrap_or_default();
     let has_vehicle = |recording: &Recorded| recording.config.vehicles.iter().any(|vehicle| vehicle.name == *name);
@@ -67,12 +68,18 @@ pub(super) fn check_sensors(file: &Path, config: &Config, recording: &Path) -> R
         |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");
     let Some(of_name) = recorded.vehicles.iter().find(|of| of.name == vehicle.name) else {
         let names: Vec<&str> = recorded.vehicles.iter().map(|of| of.name.as_str()).collect();
-        let (configured, recorded) = (vehicle.name.clone(), names.join(", "));
-        return Err(ReplayError::OtherVehicle { file: file.to_owned(), configured, recorded });
+        let (configured, recorded) = (&vehicle.name, names.join(", "));
+        let reason = format!("its vehicle is {configured}, but the recording has {recorded}; the same name is allowed");
+        return Err(ReplayError::mismatch(file, reason));
     };
     match (names(vehicle), names(of_name)) {
         (configured, recorded) if configured != recorded => {
-            Err(ReplayError::Sensors { file: file.to_owned(), vehicle: vehicle.name.clone(), configured, recorded })
+            let reason = format!(
+                "vehicle {} has the sensors [{configured}], but the recording has [{recorded}]; the same names in the \
+                 same order are allowed",
+                vehicle.name
+            );
+            Err(ReplayError::mismatch(file, reason))
         }
         _ => Ok(()),
     }

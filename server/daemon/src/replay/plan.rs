@@ -8,32 +8,29 @@ use std::sync::Arc;
 
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
+use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig, TimeConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::scan_file::ScanFormat;
 use clearway_mapping::sensor::mount::estimate;
 use nalgebra::{Isometry3, Point3, Vector3};
 
-use super::clouds::{Clouds, Written};
-use super::options::{Options, ReplayError};
-use super::record_file::check_record;
+use super::bag::{choice, extrinsics_of, keep_placed, sensors_of};
+use super::error::ReplayError;
+use super::options::ReplayOptions;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
-use crate::cli::shared::ground_revolutions::{GroundRevolutions, points_of};
-use clearway_daemon::config::{Calibrations, Config, Origin, Recorder};
-use clearway_daemon::ingest::files::mcap::{McapError, McapOptions};
-use clearway_daemon::ingest::files::{FilesError, Kind, Readings};
-use clearway_daemon::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
-use clearway_daemon::ingest::ros::decoder::PoseSource;
-use clearway_daemon::record::run_config;
-use clearway_daemon::replay::faults::Faults;
-use clearway_daemon::replay::timeline::{Timeline, Track};
-use clearway_daemon::run::Setup;
+use crate::config::{Calibrations, Config, Origin, Recorder};
+use crate::ingest::files::ground_revolutions::{GroundRevolutions, points_of};
+use crate::ingest::files::mcap::McapOptions;
+use crate::ingest::files::{Kind, Readings};
+use crate::ingest::ros::decoder::PoseSource;
+use crate::player::faults::Faults;
+use crate::player::timeline::{Timeline, Track};
+use crate::record::run_config;
+use crate::record::writer::{is_same_file, parent_of};
+use crate::run::Setup;
 use clearway_journal::reader::RecordingReader;
-
-/// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
-/// roof of a car.
-const MOUNT_HEIGHT_M: f64 = 2.0;
 
 /// What is known before the first event.
 pub(super) struct Plan {
@@ -43,17 +40,13 @@ pub(super) struct Plan {
     pub(super) timeline: Timeline,
     /// Bytes of all files.
     pub(super) bytes: u64,
-    /// Boot id of the recording whose maps are made again.
-    pub(super) boot_id: Option<u64>,
-    /// The number of point clouds written, or the error that ended the writing.
-    pub(super) clouds: Option<Written>,
 }
 
 /// Finds the configuration, the mounts and the readings of a replay.
 ///
 /// # Errors
 /// [`ReplayError`] if a file, a recording or the configuration cannot be used.
-pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
+pub(super) fn plan(options: &ReplayOptions) -> Result<Plan, ReplayError> {
     let files = Readings::open(&options.files, McapOptions::default())?;
     let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
     let journal = match &recorded {
@@ -68,7 +61,7 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
         return plan_several(options, recordings, files.bytes());
     }
     if let Some(files) = files_of_vehicle(options, &files)? {
-        return plan(&Options { files, ..options.clone() });
+        return plan(&ReplayOptions { files, ..options.clone() });
     }
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];
@@ -82,7 +75,9 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
         Some(bag) => known.apply_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
         None => None,
     };
-    known.apply_options(options)?;
+    if let Some(model) = options.model {
+        known.apply_model(model);
+    }
     let open = || Readings::open(&options.files, wanted.clone());
     let bytes = files.bytes();
     let mount = match options.extrinsics {
@@ -96,26 +91,17 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     };
     let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
     let setup = known.setup(options)?;
-    let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
-    let (observer, clouds) = clouds.map(Clouds::observer).unzip();
-    let boot_id = setup.boot_id;
     let tracks = vec![Track { files: options.files.clone(), options: wanted }];
     let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
-    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, timeline, bytes, boot_id, clouds })
+    Ok(Plan { setup, mount, extrinsics, timeline, bytes })
 }
 
 /// The plan of several vehicles in one recorded time. The files of one vehicle follow each other.
-fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Result<Plan, ReplayError> {
-    let given = [
-        ("--extrinsics", options.extrinsics.is_some()),
-        ("--model", options.model.is_some()),
-        ("--rpm", options.rpm.is_some()),
-        ("--calibration", options.calibration.is_some()),
-        ("--clouds", options.clouds.is_some()),
-    ];
+fn plan_several(options: &ReplayOptions, recordings: Vec<Recorded>, bytes: u64) -> Result<Plan, ReplayError> {
+    let given = [("--extrinsics", options.extrinsics.is_some()), ("--model", options.model.is_some())];
     if let Some((option, _)) = given.iter().find(|(_, is_given)| *is_given) {
         let reason = "the recordings have several vehicles; name one with --vehicle".to_owned();
-        return Err(ReplayError::Unused { option: (*option).to_owned(), reason });
+        return Err(ReplayError::Option { option: (*option).to_owned(), reason });
     }
     let boot_ids: BTreeSet<u64> = recordings.iter().map(|recording| recording.boot_id).collect();
     let boot_id = boot_ids.first().copied().filter(|_| boot_ids.len() == 1);
@@ -127,7 +113,9 @@ fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Res
             (vehicle.udp, vehicle.ros) = (None, None);
             match known.config.vehicles.iter().position(|before| before.name == vehicle.name) {
                 Some(index) if known.config.vehicles[index] != vehicle => {
-                    return Err(ReplayError::Differs { file, vehicle: vehicle.name });
+                    let name = &vehicle.name;
+                    let reason = format!("its configuration of vehicle {name} differs from the files before it");
+                    return Err(ReplayError::mismatch(&file, reason));
                 }
                 Some(index) => tracks[index].files.push(file.clone()),
                 None => {
@@ -142,15 +130,14 @@ fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Res
     known.config = overridden(known.config, options, &options.files[0])?;
     let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
     let setup = known.setup(options)?;
-    let boot_id = setup.boot_id;
     let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
-    Ok(Plan { setup, mount: Mount::Given, extrinsics, timeline, bytes, boot_id, clouds: None })
+    Ok(Plan { setup, mount: Mount::Given, extrinsics, timeline, bytes })
 }
 
 /// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a
 /// recording of clearway.
-fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), ReplayError> {
-    let unused = |option: String, reason: String| Err(ReplayError::Unused { option, reason });
+fn check(options: &ReplayOptions, mcap: Option<&Path>, journal: bool) -> Result<(), ReplayError> {
+    let unused = |option: String, reason: String| Err(ReplayError::Option { option, reason });
     if let Some(topic) = options.topics.first() {
         let option = format!("--topic {topic}");
         match mcap {
@@ -171,11 +158,28 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
         return unused(format!("--set {set}"), reason.into());
     }
     let Some(record) = &options.record else { return Ok(()) };
-    if let Some(from) = options.from {
+    if let Some(from) = options.from_s {
         let reason = "a recording begins with the first event; --to may end it earlier";
         return unused(format!("--from {from}"), reason.into());
     }
-    check_record(options, record)
+    check_record(&options.files, record)
+}
+
+/// Refuses a file of `--record` that exists, is no file, or would become one of the files of a folder that is replayed.
+/// The recorder refuses the name of an earlier recording's parts, and of one that is being written.
+fn check_record(files: &[PathBuf], record: &Path) -> Result<(), ReplayError> {
+    let refused = |reason: &str| Err(ReplayError::path("--record", record, reason));
+    let name = record.as_os_str().as_encoded_bytes();
+    if name.ends_with(b"/") || name.ends_with(b".unfinished.mcap") {
+        return refused("this is the name of a folder, or of a recording that is being written; name a file");
+    }
+    if record.symlink_metadata().is_ok() {
+        return refused("the file exists and is not overwritten; name another file, or delete it");
+    }
+    match files.iter().find(|file| is_same_file(file, parent_of(record))) {
+        Some(folder) => refused(&format!("the folder {} is replayed; name a file in another folder", folder.display())),
+        None => Ok(()),
+    }
 }
 
 /// What is known about the vehicle so far.
@@ -221,23 +225,12 @@ impl Known {
         self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
     }
 
-    /// Applies the sensor options. A model on the command line comes before the configured elevations.
-    fn apply_options(&mut self, options: &Options) -> Result<(), ReplayError> {
-        let sensors = &mut self.config.vehicles[0].sensors;
-        for sensor in sensors.iter_mut() {
-            (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
-            if options.model.is_some() {
-                sensor.elevations_deg.clear();
-            }
+    /// Gives each sensor this model, which comes before the configured elevations.
+    fn apply_model(&mut self, model: Model) {
+        for sensor in &mut self.config.vehicles[0].sensors {
+            sensor.model = Some(model);
+            sensor.elevations_deg.clear();
         }
-        if let Some(file) = &options.calibration {
-            sensors[0].calibration = Some(file.display().to_string());
-            // The tables of the other sensors have been read from the folder of their own configuration.
-            let mut first = self.config.clone();
-            first.vehicles[0].sensors.truncate(1);
-            self.tables[0][0] = first.calibrations(Path::new(""))?.remove(0).remove(0);
-        }
-        Ok(())
     }
 
     /// Estimates the mount of the first sensor from the ground in the first revolutions. If that fails, no map is made.
@@ -274,30 +267,29 @@ impl Known {
     }
 
     /// The setup with which the server starts.
-    fn setup(self, options: &Options) -> Result<Setup, ReplayError> {
+    fn setup(self, options: &ReplayOptions) -> Result<Setup, ReplayError> {
         let Self { config, tables: calibrations, boot_id, remarks, .. } = self;
         let file = options.config.as_deref().unwrap_or(Path::new("of the replayed files"));
         // A run that serves nothing opens none of these paths, and its boot id must not depend on the folder.
-        let mut config = if options.serve { config.located(file) } else { config };
+        let served = options.served.as_ref();
+        let mut config = if served.is_some() { config.located(file) } else { config };
         config.recorder.file = options.record.clone().unwrap_or_default();
-        config.recorder.replaces = options.force;
-        if !options.serve {
+        if served.is_none() {
             (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
             (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
         }
-        if options.any_port {
+        if served.is_some_and(|served| served.any_port) {
             let any = SocketAddr::from(([127, 0, 0, 1], 0));
             (config.grpc.listen, config.page.listen, config.foxglove.listen) = (any, any, any);
             config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
         }
         config.check(&origin(options, file))?;
-        let certificates = if options.serve { config.certificates(file)? } else { None };
+        let certificates = if served.is_some() { config.certificates(file)? } else { None };
         // The same files and settings get the same boot id. Served maps need a new one, because a reader that has seen
         // these maps before would drop them as old.
-        let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
-        let same_maps = !altered && options.calibration.is_none() && options.set.is_empty();
-        let boot_id =
-            boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
+        let is_altered = options.extrinsics.is_some() || options.model.is_some() || !options.set.is_empty();
+        let of_settings = || served.is_none().then(|| fingerprint(&config, &options.files));
+        let boot_id = boot_id.filter(|_| !is_altered).or_else(of_settings);
         let mut notes = BTreeMap::new();
         if !remarks.is_empty() {
             notes.insert("mount".to_owned(), remarks.join("\n"));
@@ -318,29 +310,33 @@ impl Known {
 
 /// Where a wrong value of the configuration was given. The configuration was checked when it was read, so a value is
 /// wrong because of the options, or of the mounts in a bag.
-fn origin(options: &Options, file: &Path) -> Origin {
-    let extrinsics = options
-        .extrinsics
-        .map(|e| format!("--extrinsics {},{},{},{},{},{}", e.x_m, e.y_m, e.z_m, e.roll_deg, e.pitch_deg, e.yaw_deg));
-    let rpm = options.rpm.map(|rpm| format!("--rpm {rpm}"));
-    let given: Vec<String> = rpm.into_iter().chain(extrinsics).collect();
-    if given.is_empty() { Origin::file(file) } else { Origin::Options(given) }
+fn origin(options: &ReplayOptions, file: &Path) -> Origin {
+    match options.extrinsics {
+        None => Origin::file(file),
+        Some(Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg }) => {
+            Origin::Options(vec![format!("--extrinsics {x_m},{y_m},{z_m},{roll_deg},{pitch_deg},{yaw_deg}")])
+        }
+    }
 }
 
 /// The configuration of `--config`, else of the recording, else the default one.
-fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, ReplayError> {
+fn configured(options: &ReplayOptions, recorded: Option<&Path>) -> Result<Known, ReplayError> {
     let known =
         |config, tables, boot_id, is_mounted| Known { config, tables, boot_id, is_mounted, remarks: Vec::new() };
     let pick = |file: &Path, config: &mut Config, tables: &mut Calibrations| {
         let known = || config.vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", ");
         let index = match &options.vehicle {
             None if config.vehicles.len() > 1 => {
-                return Err(ReplayError::Vehicles { file: file.to_owned(), known: known() });
+                let reason = format!("it has the vehicles {}; name one with --vehicle", known());
+                return Err(ReplayError::mismatch(file, reason));
             }
             None => 0,
             Some(name) => {
                 let found = config.vehicles.iter().position(|vehicle| vehicle.name == *name);
-                found.ok_or_else(|| ReplayError::Vehicle { name: name.clone(), known: known() })?
+                found.ok_or_else(|| ReplayError::Option {
+                    option: format!("--vehicle {name}"),
+                    reason: format!("the configuration has: {}", known()),
+                })?
             }
         };
         config.vehicles = vec![config.vehicles.swap_remove(index)];
@@ -368,69 +364,11 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
 }
 
 /// A recorded configuration with the overrides of the options.
-fn overridden(config: Config, options: &Options, recording: &Path) -> Result<Config, ReplayError> {
+fn overridden(config: Config, options: &ReplayOptions, recording: &Path) -> Result<Config, ReplayError> {
     match &options.set[..] {
         [] => Ok(config),
         set => Ok(Config::parse(&config.to_toml(), recording, set)?),
     }
-}
-
-/// The topics of a ROS bag to read.
-fn choice(bag: &Path, wanted: &McapOptions) -> Result<TopicChoice, ReplayError> {
-    let offered = AvailableTopics::from_file(bag).map_err(McapError::from).map_err(FilesError::from)?;
-    let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
-    Ok(choice.map_err(FilesError::from)?)
-}
-
-/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the
-/// mount `is_given`, the first sensor counts as placed.
-fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
-    let mut number = 0;
-    let mut known = |sensor: &SensorTopic| {
-        number += 1;
-        sensor.ego_from_sensor.is_some() || (number == 1 && is_given)
-    };
-    match sensors.iter().any(|sensor| sensor.ego_from_sensor.is_some()) {
-        true => sensors.retain(&mut known),
-        false => sensors.truncate(1),
-    }
-}
-
-/// The configuration of each sensor of a ROS bag, and its mount if tf has it. A single sensor is named `top`, several
-/// are named after their frames.
-fn sensors_of(choice: &TopicChoice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
-    let mut sensors: Vec<SensorConfig> = Vec::new();
-    for (index, sensor) in choice.sensors.iter().enumerate() {
-        let mut name = name_of_frame(&sensor.frame_id);
-        if choice.sensors.len() == 1 {
-            name = "top".to_owned();
-        } else if sensors.iter().any(|before| before.name == name) {
-            name = format!("{name}-{index}");
-        }
-        // Without a transform the mount is given or estimated later.
-        let unknown = || Isometry3::translation(0.0, 0.0, MOUNT_HEIGHT_M);
-        let ego_from_sensor = sensor.ego_from_sensor.unwrap_or_else(unknown);
-        sensors.push(SensorConfig::new(name, extrinsics_of(&ego_from_sensor)));
-    }
-    let mount = |sensor: &SensorTopic| {
-        let tf = Mount::Tf { ego_frame: choice.ego_frame.clone(), frame_id: sensor.frame_id.clone() };
-        sensor.ego_from_sensor.map(|_| tf)
-    };
-    (sensors, choice.sensors.iter().map(mount).collect())
-}
-
-/// A frame's id, with each character that a sensor's name cannot have replaced by `_`.
-fn name_of_frame(frame_id: &str) -> String {
-    let letter = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c.to_ascii_lowercase() } else { '_' };
-    let name: String = frame_id.chars().map(letter).take(48).collect();
-    if name.is_empty() { "sensor".to_owned() } else { name }
-}
-
-fn extrinsics_of(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
-    let (roll, pitch, yaw) = ego_from_sensor.rotation.euler_angles();
-    let [x_m, y_m, z_m] = ego_from_sensor.translation.vector.into();
-    let [roll_deg, pitch_deg, yaw_deg] = [roll, pitch, yaw].map(f64::to_degrees);
-    Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg }
 }
 
 /// The points of the first revolutions or scans, in the sensor frame, in metres.

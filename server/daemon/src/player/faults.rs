@@ -1,7 +1,7 @@
 //! Faults on demand: readings of a recorded drive -> the readings of the same drive with a sensor lost, packets lost, a
 //! step of the clock, a jump of the poses, or a stopped server.
 //!
-//! A fault depends only on its text, the seed and the number of the reading, so each jump and each repetition of a
+//! A fault depends only on its text, its place and the number of the reading, so each jump and each repetition of a
 //! replay has the same faults.
 
 use std::str::FromStr;
@@ -94,7 +94,6 @@ impl FromStr for Fault {
 #[derive(Clone, Debug, Default)]
 pub struct Faults {
     faults: Vec<Fault>,
-    seed: u64,
     sensors: Vec<Vec<String>>,
     /// Number of readings that each fault has dropped or altered.
     counts: Vec<u64>,
@@ -105,7 +104,7 @@ impl Faults {
     ///
     /// # Errors
     /// [`FaultError`] if no vehicle has the sensor of a fault, or a fault begins after the drive.
-    pub fn new(faults: Vec<Fault>, seed: u64, length_s: f64, sensors: Vec<Vec<String>>) -> Result<Self, FaultError> {
+    pub fn new(faults: Vec<Fault>, length_s: f64, sensors: Vec<Vec<String>>) -> Result<Self, FaultError> {
         for fault in &faults {
             if fault.from_s > length_s {
                 let reason = format!("it begins after the drive, which is {length_s:.3} s long");
@@ -119,34 +118,7 @@ impl Faults {
                 return Err(FaultError { text: fault.text.clone(), reason });
             }
         }
-        Ok(Self { counts: vec![0; faults.len()], faults, seed, sensors })
-    }
-
-    /// One fault of each kind within a drive of this length, drawn from the seed.
-    ///
-    /// # Errors
-    /// None: the sensors are those of the drive.
-    pub fn random(seed: u64, length_s: f64, sensors: &[Vec<String>]) -> Vec<Fault> {
-        let draw = |number: u64, of: f64| share(seed, u64::MAX - number) * of;
-        let names: Vec<&String> = sensors.iter().flatten().collect();
-        let (lost, stop) = (draw(0, 0.7 * length_s), draw(1, 0.7 * length_s));
-        let mut texts = vec![
-            format!("loss:{:.1}", 1.0 + draw(2, 9.0)),
-            format!("clock:{:.0}@{:.2}", draw(3, 1000.0) - 500.0, draw(4, length_s)),
-            format!(
-                "pose:{:.1},{:.1},{:.0}@{:.2}",
-                draw(5, 4.0) - 2.0,
-                draw(6, 4.0) - 2.0,
-                draw(7, 20.0) - 10.0,
-                draw(8, length_s)
-            ),
-            format!("stop@{stop:.2}-{:.2}", stop + 0.1 + draw(9, 0.2 * length_s)),
-        ];
-        if !names.is_empty() {
-            let name = names[(draw(10, names.len() as f64) as usize).min(names.len() - 1)];
-            texts.push(format!("lost:{name}@{lost:.2}-{:.2}", lost + 0.1 + draw(11, 0.2 * length_s)));
-        }
-        texts.iter().filter_map(|text| text.parse().ok()).collect()
+        Ok(Self { counts: vec![0; faults.len()], faults, sensors })
     }
 
     /// The reading with the faults, `after_s` after the first event and the `number`th of the drive; `None` if it does
@@ -160,7 +132,7 @@ impl Faults {
             let sensor = self.sensors.get(vehicle).and_then(|of| of.get(usize::from(reading.source)));
             let is_dropped = match &fault.kind {
                 Kind::Lost { sensor: lost } => is_data && sensor == Some(lost),
-                Kind::Loss { share: least } => is_data && share(self.seed ^ index as u64, number) < *least,
+                Kind::Loss { share: least } => is_data && share(index as u64, number) < *least,
                 Kind::Stop => !matches!(reading.body, Body::Sensor(_) | Body::Withdrawn | Body::End),
                 Kind::Clock { step_ns } => {
                     reading.arrival_ns = reading.arrival_ns.saturating_add(*step_ns);
@@ -190,7 +162,7 @@ impl Faults {
     }
 }
 
-/// A number from 0 to 1 that depends on the seed and a number alone (SplitMix64).
+/// A number from 0 to 1 that depends on a seed and a number alone (SplitMix64).
 fn share(seed: u64, number: u64) -> f64 {
     let mut z = seed.wrapping_add(number.wrapping_mul(0x9E37_79B9_7F4A_7C15));
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -210,7 +182,7 @@ mod tests {
 
     fn faults(texts: &[&str]) -> Faults {
         let faults = texts.iter().map(|text| text.parse().unwrap()).collect();
-        Faults::new(faults, 7, 100.0, vec![vec!["top".into(), "rear".into()]]).unwrap()
+        Faults::new(faults, 100.0, vec![vec!["top".into(), "rear".into()]]).unwrap()
     }
 
     #[test]
@@ -257,11 +229,9 @@ mod tests {
             assert!(error.contains(reason) && error.contains("stop@FROM-TO"), "{error}");
         }
         let refused = |text: &str| {
-            Faults::new(vec![text.parse().unwrap()], 0, 5.0, vec![vec!["top".into()]]).unwrap_err().to_string()
+            Faults::new(vec![text.parse().unwrap()], 5.0, vec![vec!["top".into()]]).unwrap_err().to_string()
         };
         assert!(refused("lost:front@1-2").contains("known: top"));
         assert!(refused("pose:1,2,3@5.1").contains("it begins after the drive, which is 5.000 s long"));
-        assert_eq!(Faults::random(3, 60.0, &[vec!["top".into()]]), Faults::random(3, 60.0, &[vec!["top".into()]]));
-        assert_eq!(Faults::random(3, 60.0, &[vec!["top".into()]]).len(), 5);
     }
 }

@@ -7,9 +7,9 @@ use clearway_mapping::map::ElevationSource;
 use clearway_mapping::sensor::mount::{MountError, MountEstimate};
 use serde_json::{Map, Value, json};
 
-use crate::cli::shared::output::counted;
-use clearway_daemon::ingest::files::Truncated;
-use clearway_daemon::status::Snapshot;
+use crate::base::counted::counted;
+use crate::ingest::files::Truncated;
+use crate::status::Snapshot;
 
 /// Where the extrinsics of the first sensor come from.
 #[derive(Clone, Debug, PartialEq)]
@@ -33,7 +33,7 @@ pub enum Mount {
 
 /// The result of a replay.
 #[derive(Clone, Debug)]
-pub struct Summary {
+pub struct ReplaySummary {
     /// Name of the first vehicle.
     pub vehicle: String,
     /// Counters, sensors, maps and latency of the first vehicle.
@@ -48,12 +48,12 @@ pub struct Summary {
     pub truncated: Vec<Truncated>,
     /// Remarks about the files, one a line.
     pub notes: Vec<String>,
-    /// Number of point clouds written.
-    pub clouds: u64,
     /// Duration of the replay, in seconds.
     pub seconds: f64,
     /// The recording that was written.
     pub record: Option<PathBuf>,
+    /// What is replayed, for people: the whole drive, or a range of it.
+    pub what: &'static str,
     /// False if the replay was stopped before its end.
     pub reached_end: bool,
 }
@@ -79,7 +79,7 @@ pub fn why_no_map(mount: &Mount, snapshot: &Snapshot) -> String {
     )
 }
 
-impl Summary {
+impl ReplaySummary {
     /// The summary as one JSON object.
     pub fn to_json(&self) -> Value {
         let mut document = snapshot_json(&self.snapshot);
@@ -89,7 +89,6 @@ impl Summary {
             "mount": self.mount_json(),
             "truncated": truncated.collect::<Vec<_>>(),
             "notes": self.notes,
-            "clouds": self.clouds,
             "record": self.record,
             "reached_end": self.reached_end,
             "seconds": self.seconds,
@@ -171,9 +170,6 @@ impl Summary {
         }
         if !self.reached_end {
             lines.push("stopped before the end".to_owned());
-        }
-        if self.clouds > 0 {
-            lines.push(format!("{} written", counted(self.clouds, "point cloud")));
         }
         lines.join("\n") + "\n"
     }
