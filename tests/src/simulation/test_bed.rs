@@ -113,7 +113,15 @@ impl<'a> TestBed<'a> {
         let (newest, receiver) = watch::channel(None);
         let pipeline = Pipeline::new(&vehicle.core(), tables).expect("a valid car");
         let valid_ms = vehicle.maps.valid_ms;
-        let engine = Engine { pipeline, valid_ms, newest, recording: journal, status: status.clone(), replayed: None };
+        let engine = Engine {
+            pipeline,
+            valid_ms,
+            newest,
+            recording: journal,
+            status: status.clone(),
+            observer: None,
+            replayed: None,
+        };
         let mut rng = Rng::new(!plan.seed);
         let (outcome_sender, outcomes) = unbounded_channel();
         Self {

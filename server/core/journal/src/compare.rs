@@ -112,10 +112,8 @@ pub struct MapChange {
     pub gained_m2: f64,
     /// Area that was free and is no more, in square metres.
     pub lost_m2: f64,
-    /// The layer before.
-    pub before: Layer,
-    /// The layer after.
-    pub after: Layer,
+    /// Name of the layer.
+    pub layer: String,
 }
 
 /// Two sets of maps cannot be compared.
@@ -414,10 +412,9 @@ impl LayerChange {
             cells: is.layer.grid.cell_count(),
             gained_m2: 0.0,
             lost_m2: 0.0,
-            before: was.layer,
-            after: is.layer,
+            layer: is.layer.name.clone(),
         };
-        let (before, after) = (&one.before, &one.after);
+        let (before, after) = (&was.layer, &is.layer);
         let same_grid = before.grid == after.grid;
         let is_same = same_grid && before.channels == after.channels && before.legend == after.legend;
         let columns = after.grid.shape().1.max(1);

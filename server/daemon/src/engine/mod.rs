@@ -40,6 +40,9 @@ use clearway_journal::encode::{self, EncodedMap, Replayed};
 /// ms.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
+/// A function that is called with the pipeline after each event that completed a revolution.
+pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
+
 /// What a turn has taken so far.
 struct TurnWork {
     time: WorkTime,
@@ -65,6 +68,8 @@ pub struct Engine {
     pub recording: Option<RecordingHandle>,
     /// The status that shows ledger, rates and latency.
     pub status: Arc<VehicleStatus>,
+    /// Is called after each revolution.
+    pub observer: Option<Observer>,
     /// How the header of the next map differs from that of a live one; `None` if it does not.
     pub replayed: Option<Replayed>,
 }
@@ -203,7 +208,7 @@ impl Engine {
         outcome.map(|_| ())
     }
 
-    /// Encodes the newest map and gives it to readers and recorder. Its computation `began` after its event
+    /// Encodes the newest map and gives it to readers, recorder and observer. Its computation `began` after its event
     /// had `waited`; `work` is that of its turn so far. Both are `None` if no event made the map.
     fn publish(&mut self, began: Instant, work: Option<&TurnWork>, waited: Option<Duration>) {
         let computed = began.elapsed();
@@ -251,6 +256,9 @@ impl Engine {
             if let Some(recording) = &mut self.recording {
                 recording.record_map(&encoded, self.status.traces.hop(&encoded, "record", None));
             }
+        }
+        if let Some(observer) = &mut self.observer {
+            observer(&self.pipeline);
         }
     }
 

@@ -7,9 +7,10 @@ use std::time::Duration;
 
 use crate::base::held_sockets::HeldSockets;
 use crate::config::{Calibrations, Certificates, Config};
+use crate::engine::Observer;
 use crate::ingest::udp;
-use crate::player::ReplayHandle;
 use crate::record::writer::{IncompleteRecordingError, RecordError};
+use crate::replay::ReplayHandle;
 
 /// The parameters of a server.
 #[derive(Default)]
@@ -28,6 +29,8 @@ pub struct Setup {
     pub config_comments: Vec<String>,
     /// Further metadata of the recording, by name.
     pub metadata: BTreeMap<String, String>,
+    /// Is called after each revolution of the first vehicle.
+    pub observer: Option<Observer>,
     /// True if the caller steps the engines ([`Running::stepped`](super::Running::stepped)); else each has a thread.
     pub is_stepped: bool,
     /// Sockets that a service manager holds; their services use them and bind none.

@@ -29,8 +29,8 @@ use crate::base::held_sockets::HeldSockets;
 #[cfg(feature = "zenoh")]
 use crate::config::ZenohMode;
 use crate::config::{self, Certificates, Config, Vehicle, listeners};
-use crate::engine::Engine;
 use crate::engine::turns::Turns;
+use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
@@ -69,6 +69,7 @@ impl Server {
             return Err(StartError::NoStore);
         }
         let boot_id = boot_id.unwrap_or_else(random);
+        let mut observer = setup.observer;
         calibrations.resize_with(config.vehicles.len(), Vec::new);
         let mut running = Running::default();
         running.replay = setup.replay;
@@ -78,7 +79,7 @@ impl Server {
             tables.resize(vehicle.sensors.len(), None);
             let core = (vehicle.core(), tables.clone());
             let pipeline = Pipeline::new(&core.0, core.1.clone())?;
-            prepared.push(running.prepare(vehicle, boot_id, pipeline, core));
+            prepared.push(running.prepare(vehicle, boot_id, pipeline, core, observer.take()));
         }
         running.vehicles = Vehicles(prepared.iter().map(|prepared| prepared.served.clone()).collect());
         let header = || header(&config, &calibrations, boot_id, &setup.config_comments, setup.metadata);
@@ -120,6 +121,7 @@ impl Running {
         boot_id: u64,
         pipeline: Pipeline,
         core: (VehicleConfig, Vec<Option<Calibration>>),
+        observer: Option<Observer>,
     ) -> Prepared {
         let name: Arc<str> = vehicle.name.as_str().into();
         let (queue, events) = event_queue(vehicle.queue);
@@ -130,7 +132,8 @@ impl Running {
         let status = Arc::new(status.with_outline(vehicle.body.as_ref()).with_traces(self.traces.clone()));
         let (newest, receiver) = watch::channel(None);
         let valid_ms = vehicle.maps.valid_ms;
-        let engine = Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), replayed: None };
+        let engine =
+            Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), observer, replayed: None };
         self.inputs.push(VehicleInput { name, queue, udp: None });
         Prepared { served: Served { status, newest: receiver }, engine, events, core }
     }

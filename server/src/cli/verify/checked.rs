@@ -21,9 +21,9 @@ pub enum Check {
     /// Its maps are those of its events.
     Verify,
     /// What another configuration changes in its maps; without one, the recorded configuration with overrides.
-    Config { config: Option<Box<NewConfig>>, set: Vec<String>, worst: usize },
+    Config { config: Option<Box<NewConfig>>, set: Vec<String> },
     /// What differs in the maps of another recording.
-    Against { other: PathBuf, worst: usize },
+    Against(PathBuf),
 }
 
 /// A configuration and its calibration tables.
@@ -46,13 +46,11 @@ pub struct Checked {
     pub file: PathBuf,
     /// Time that the check took, in seconds.
     pub seconds: f64,
-    pub outcome: Outcome,
-    /// Pictures that were drawn of its changes.
-    pub pictures: Vec<PathBuf>,
+    pub outcome: CheckOutcome,
 }
 
 /// What a check found.
-pub enum Outcome {
+pub enum CheckOutcome {
     Verified(Report),
     Compared(Comparison),
     /// The file cannot be read, or its maps cannot be made or compared: the reason.
@@ -62,43 +60,43 @@ pub enum Outcome {
 impl Checked {
     /// The result of files, patterns and stores that name no recording.
     pub fn not_found(given: &[String], reason: String) -> Self {
-        let (file, outcome) = (given.join(" ").into(), Outcome::Unreadable(reason));
-        Self { file, seconds: 0.0, outcome, pictures: Vec::new() }
+        let (file, outcome) = (given.join(" ").into(), CheckOutcome::Unreadable(reason));
+        Self { file, seconds: 0.0, outcome }
     }
 
     /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole,
     /// has no event or no map to compare, else [`Exit::Good`].
     pub fn exit(&self) -> Exit {
         match &self.outcome {
-            Outcome::Verified(report) if report.different > 0 => Exit::Differs,
-            Outcome::Verified(report) => Exit::from_incomplete(!report.is_good() || report.incomplete.is_some()),
-            Outcome::Compared(comparison) if !comparison.is_equal() => Exit::Differs,
-            Outcome::Compared(comparison) => {
+            CheckOutcome::Verified(report) if report.different > 0 => Exit::Differs,
+            CheckOutcome::Verified(report) => Exit::from_incomplete(!report.is_good() || report.incomplete.is_some()),
+            CheckOutcome::Compared(comparison) if !comparison.is_equal() => Exit::Differs,
+            CheckOutcome::Compared(comparison) => {
                 Exit::from_incomplete(comparison.incomplete.is_some() || comparison.before + comparison.after == 0)
             }
-            Outcome::Unreadable(_) => Exit::Unreadable,
+            CheckOutcome::Unreadable(_) => Exit::Unreadable,
         }
     }
 
     /// Why the file was not checked; `None` if it was.
     pub fn not_checked(&self) -> Option<&String> {
         match &self.outcome {
-            Outcome::Unreadable(reason) => Some(reason),
-            Outcome::Verified(_) | Outcome::Compared(_) => None,
+            CheckOutcome::Unreadable(reason) => Some(reason),
+            CheckOutcome::Verified(_) | CheckOutcome::Compared(_) => None,
         }
     }
 
     /// True if the maps that were compared are equal, and the file is not whole.
     pub fn is_equal_but_not_whole(&self) -> bool {
         let incomplete = match &self.outcome {
-            Outcome::Verified(report) => report.incomplete.as_ref(),
-            Outcome::Compared(comparison) => comparison.incomplete.as_ref(),
-            Outcome::Unreadable(_) => None,
+            CheckOutcome::Verified(report) => report.incomplete.as_ref(),
+            CheckOutcome::Compared(comparison) => comparison.incomplete.as_ref(),
+            CheckOutcome::Unreadable(_) => None,
         };
         let is_empty = match &self.outcome {
-            Outcome::Verified(report) => report.equal == 0,
-            Outcome::Compared(comparison) => comparison.before + comparison.after == 0,
-            Outcome::Unreadable(_) => true,
+            CheckOutcome::Verified(report) => report.equal == 0,
+            CheckOutcome::Compared(comparison) => comparison.before + comparison.after == 0,
+            CheckOutcome::Unreadable(_) => true,
         };
         self.exit() == Exit::Unreadable && incomplete.is_some() && !is_empty
     }
@@ -109,8 +107,12 @@ impl Checked {
     }
 }
 
-/// Checks all files, at most `jobs` at the same time; the results are in the order of the files.
-pub fn check_all(files: &[PathBuf], check: &Check, jobs: usize) -> Vec<Checked> {
+/// Number of the maps that changed most that are listed for each recording. Ours: they fit a screen.
+const WORST: usize = 5;
+
+/// Checks all files, as many at the same time as there are processors; the results are in the order of the files.
+pub fn check_all(files: &[PathBuf], check: &Check) -> Vec<Checked> {
+    let jobs = std::thread::available_parallelism().map_or(1, usize::from);
     let next = AtomicUsize::new(0);
     let results: Mutex<Vec<Option<Checked>>> = Mutex::new(files.iter().map(|_| None).collect());
     std::thread::scope(|scope| {
@@ -130,12 +132,12 @@ pub fn check_all(files: &[PathBuf], check: &Check, jobs: usize) -> Vec<Checked> 
 
 fn check_one(file: &Path, check: &Check) -> Checked {
     let began = Instant::now();
-    let outcome = outcome_of(file, check).unwrap_or_else(|error| Outcome::Unreadable(with_causes(&error)));
-    Checked { file: file.to_owned(), seconds: began.elapsed().as_secs_f64(), outcome, pictures: Vec::new() }
+    let outcome = outcome_of(file, check).unwrap_or_else(|error| CheckOutcome::Unreadable(with_causes(&error)));
+    Checked { file: file.to_owned(), seconds: began.elapsed().as_secs_f64(), outcome }
 }
 
 /// The outcome of a file, or of a recording in a store, which is copied here meanwhile.
-fn outcome_of(file: &Path, check: &Check) -> Result<Outcome> {
+fn outcome_of(file: &Path, check: &Check) -> Result<CheckOutcome> {
     #[cfg(feature = "store")]
     if let Some(url) = file.to_str().filter(|text| super::files::is_url(text)) {
         let copy = crate::cli::shared::output::block_on(clearway_daemon::store::fetch::fetch(url))?;
@@ -146,12 +148,12 @@ fn outcome_of(file: &Path, check: &Check) -> Result<Outcome> {
     outcome(file, check)
 }
 
-fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
+fn outcome(file: &Path, check: &Check) -> Result<CheckOutcome> {
     Ok(match check {
-        Check::Verify => Outcome::Verified(verify(file)?),
-        Check::Against { other, worst } => {
+        Check::Verify => CheckOutcome::Verified(verify(file)?),
+        Check::Against(other) => {
             super::same_drive::check(file, other)?;
-            let comparison = compare(file, &After::Recording(other), *worst)?;
+            let comparison = compare(file, &After::Recording(other), WORST)?;
             if comparison.layers.values().all(|layer| layer.maps == 0) {
                 bail!(
                     "no map in common with {}: no vehicle and layer has maps of one stamp on both sides; are they \
@@ -159,9 +161,9 @@ fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
                     other.display()
                 );
             }
-            Outcome::Compared(comparison)
+            CheckOutcome::Compared(comparison)
         }
-        Check::Config { config, set, worst } => {
+        Check::Config { config, set } => {
             let given = match config.as_deref() {
                 Some(NewConfig(config, tables)) => recorded_vehicles(config, tables.clone()),
                 None => {
@@ -172,7 +174,7 @@ fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
             };
             let (config, tables) = run_config(&RecordingReader::open(file)?)?;
             let recorded = &recorded_vehicles(&config, tables);
-            Outcome::Compared(compare(file, &After::Config { given: &given, recorded }, *worst)?)
+            CheckOutcome::Compared(compare(file, &After::Config { given: &given, recorded }, WORST)?)
         }
     })
 }

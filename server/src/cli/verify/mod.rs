@@ -8,7 +8,6 @@
 //! | `same_drive` | two recordings -> whether they are of one drive |
 //! | `table` | results -> text |
 //! | `report` | results -> JSON, JUnit XML |
-//! | `pictures` | the maps that changed most -> pictures |
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -24,8 +23,6 @@ use crate::cli::shared::output::{print, print_line, printable};
 
 mod checked;
 mod files;
-#[cfg(feature = "tools")]
-mod pictures;
 mod report;
 mod same_drive;
 mod table;
@@ -44,11 +41,11 @@ Examples:
   clearway verify 'drives/**/*.mcap' --junit verify.xml
   clearway verify drives --shard 2/5 --json
   clearway verify s3://fleet/clearway/parts --shard 2/5
-  clearway verify drives --config new.toml --pictures changes
+  clearway verify drives --config new.toml
   clearway verify drive.mcap --set vehicle.maps.reach.vehicle_width_m=2.5
   clearway verify before.mcap --against after.mcap"
 )]
-pub struct Options {
+pub struct VerifyArguments {
     /// Recordings (MCAP), folders of them, patterns in quotes, such as 'drives/**/*.mcap', or URLs of a store or of a
     /// recording in it, such as s3://BUCKET/PREFIX.
     #[arg(required = true, value_name = "FILES")]
@@ -57,9 +54,6 @@ pub struct Options {
     /// files; a part without files is no error.
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Number of files that are checked at the same time; the number of processors if absent.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
-    jobs: Option<u16>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -67,13 +61,13 @@ pub struct Options {
     #[arg(long, value_name = "FILE.xml")]
     junit: Option<PathBuf>,
     #[command(flatten)]
-    change: Change,
+    change: ChangeArguments,
 }
 
 /// The options that compare the recorded maps with others.
 #[derive(Args)]
 #[command(next_help_heading = "Compare a change")]
-struct Change {
+struct ChangeArguments {
     /// Compare the recorded maps with those that this configuration makes of the recorded events.
     #[arg(long, value_name = "NEW.toml", conflicts_with = "against")]
     config: Option<PathBuf>,
@@ -83,24 +77,16 @@ struct Change {
     /// Compare the maps with those of this recording of the same drive.
     #[arg(long, value_name = "OTHER.mcap")]
     against: Option<PathBuf>,
-    /// Number of the maps that changed most to list for each recording.
-    #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u16).range(0..=1000))]
-    worst: u16,
-    #[cfg(feature = "tools")]
-    /// Draw these maps to this folder: before, after, and what changed.
-    #[arg(long, value_name = "FOLDER")]
-    pictures: Option<PathBuf>,
 }
 
-impl Change {
+impl ChangeArguments {
     fn check(&self) -> Result<Check> {
-        let worst = usize::from(self.worst);
         Ok(match (&self.config, &self.against) {
-            (_, Some(other)) => Check::Against { other: other.clone(), worst },
+            (_, Some(other)) => Check::Against(other.clone()),
             (None, None) if self.set.is_empty() => Check::Verify,
             (config, None) => {
                 let config = config.as_ref().map(|file| NewConfig::load(file, &self.set)).transpose()?;
-                Check::Config { config: config.map(Box::new), set: self.set.clone(), worst }
+                Check::Config { config: config.map(Box::new), set: self.set.clone() }
             }
         })
     }
@@ -110,25 +96,15 @@ impl Change {
 /// differs.
 ///
 /// # Errors
-/// If the configuration is wrong, or a report or a picture cannot be written.
-pub fn run(options: &Options) -> Result<Exit> {
+/// If the configuration is wrong, or a report cannot be written.
+pub fn run(options: &VerifyArguments) -> Result<Exit> {
     let check = options.change.check()?;
-    #[cfg(feature = "tools")]
-    if let (Some(_), Check::Verify) = (&options.change.pictures, &check) {
-        return Err(crate::cli::shared::output::usage_error("--pictures needs --config, --set or --against"));
-    }
     options.junit.as_deref().map_or(Ok(()), report::check_junit)?;
-    let jobs = options.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
-    let mut results = match files::find(&options.files, options.shard) {
-        Ok(files) => checked::check_all(&files, &check, jobs),
+    let results = match files::find(&options.files, options.shard) {
+        Ok(files) => checked::check_all(&files, &check),
         // In the reports too: a machine that collects them has to find the reason.
         Err(error) => vec![Checked::not_found(&options.files, format!("{error:#}"))],
     };
-    #[cfg(feature = "tools")]
-    if let Some(folder) = &options.change.pictures {
-        one_file::create_folder(folder)?;
-        results.iter_mut().try_for_each(|result| pictures::draw(result, folder))?;
-    }
     if let Some(file) = &options.junit {
         one_file::write(file, report::junit(&results).as_bytes())?;
     }

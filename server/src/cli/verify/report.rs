@@ -8,7 +8,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result, bail};
 use serde_json::{Value, json};
 
-use super::checked::{Checked, Outcome};
+use super::checked::{CheckOutcome, Checked};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::counted;
 use clearway_journal::RecordedMaps;
@@ -18,9 +18,9 @@ use clearway_journal::compare::{Comparison, LayerChange, MapChange};
 const XML: &str = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites name=\"clearway verify\"";
 
 /// The result of one file in one line: `equal`, the first difference, or why it cannot be read.
-pub fn reason(outcome: &Outcome) -> String {
+pub fn reason(outcome: &CheckOutcome) -> String {
     match outcome {
-        Outcome::Verified(report) => {
+        CheckOutcome::Verified(report) => {
             let is_whole = report.incomplete.is_none() && report.repaired.is_empty() && report.dropped == 0;
             let events = if is_whole { "the events are whole" } else { "the events that are left are in order" };
             let result = match report.differences.first() {
@@ -55,7 +55,7 @@ pub fn reason(outcome: &Outcome) -> String {
             let incomplete = report.incomplete.iter().map(|how| format!("; the file is not whole: {how}"));
             result + &unjudged + &dropped + &repaired + &incomplete.collect::<String>()
         }
-        Outcome::Compared(comparison) => {
+        CheckOutcome::Compared(comparison) => {
             let result = match comparison {
                 Comparison { before: 0, after: 0, .. } => "no map on either side, so nothing is compared".to_owned(),
                 equal if equal.is_equal() && equal.unpaired() > 0 => {
@@ -69,7 +69,7 @@ pub fn reason(outcome: &Outcome) -> String {
             let incomplete = comparison.incomplete.iter().map(|how| format!("; {how}"));
             result + after_loss + &incomplete.collect::<String>()
         }
-        Outcome::Unreadable(reason) => format!("not checked: {reason}"),
+        CheckOutcome::Unreadable(reason) => format!("not checked: {reason}"),
     }
 }
 
@@ -102,15 +102,12 @@ pub fn json(results: &[Checked]) -> Value {
     let file = |result: &Checked| {
         let mut object = json!({ "file": result.file, "seconds": result.seconds, "ok": result.is_good() });
         let details = match &result.outcome {
-            Outcome::Verified(report) => report.to_json(),
-            Outcome::Compared(comparison) => comparison_json(comparison),
-            Outcome::Unreadable(reason) => json!({ "not_checked": reason }),
+            CheckOutcome::Verified(report) => report.to_json(),
+            CheckOutcome::Compared(comparison) => comparison_json(comparison),
+            CheckOutcome::Unreadable(reason) => json!({ "not_checked": reason }),
         };
         if let (Value::Object(object), Value::Object(details)) = (&mut object, details) {
             object.extend(details);
-            if !result.pictures.is_empty() {
-                object.insert("pictures".into(), json!(result.pictures));
-            }
         }
         object
     };
@@ -137,7 +134,7 @@ fn comparison_json(comparison: &Comparison) -> Value {
     };
     let worst = |map: &MapChange| {
         json!({
-            "vehicle": map.vehicle, "layer": map.after.name, "sequence": map.sequence, "stamp_ns": map.stamp_ns,
+            "vehicle": map.vehicle, "layer": map.layer, "sequence": map.sequence, "stamp_ns": map.stamp_ns,
             "changed": map.changed, "cells": map.cells,
             "free_gained_m2": map.gained_m2, "free_lost_m2": map.lost_m2,
         })
@@ -188,10 +185,10 @@ pub fn junit(results: &[Checked]) -> String {
         let _ = match &result.outcome {
             _ if result.is_good() => writeln!(xml, "/>"),
             _ if result.exit() == Exit::Unreadable => writeln!(xml, "><error message=\"{message}\"/></testcase>"),
-            Outcome::Compared(_) | Outcome::Unreadable(_) => {
+            CheckOutcome::Compared(_) | CheckOutcome::Unreadable(_) => {
                 writeln!(xml, "><failure message=\"{message}\"/></testcase>")
             }
-            Outcome::Verified(report) => {
+            CheckOutcome::Verified(report) => {
                 let all: Vec<_> = report.differences.iter().map(|one| escaped(&one.to_string())).collect();
                 writeln!(xml, "><failure message=\"{message}\">{}</failure></testcase>", all.join("\n"))
             }
@@ -225,14 +222,14 @@ mod tests {
 
     #[test]
     fn junit_is_xml_with_a_case_for_each_file_whatever_its_name() {
-        let checked = |file: &str, outcome| Checked { file: file.into(), seconds: 0.25, outcome, pictures: Vec::new() };
+        let checked = |file: &str, outcome| Checked { file: file.into(), seconds: 0.25, outcome };
         let kind = DifferenceKind::Cell { row: 3, column: 17, channel: "class".into(), recorded: 1, computed: 3 };
         let difference = Difference { vehicle: "car".into(), sequence: 2, layer: "terrain".into(), kind };
         let report = Report { differences: vec![difference], different: 1, ..Report::default() };
         let results = [
-            checked("a&b <\"c\">.mcap", Outcome::Verified(Report { events: 9, ..Report::default() })),
-            checked("d.mcap", Outcome::Verified(report)),
-            checked("e.mcap", Outcome::Unreadable("line 1\nbyte \u{1}".into())),
+            checked("a&b <\"c\">.mcap", CheckOutcome::Verified(Report { events: 9, ..Report::default() })),
+            checked("d.mcap", CheckOutcome::Verified(report)),
+            checked("e.mcap", CheckOutcome::Unreadable("line 1\nbyte \u{1}".into())),
         ];
         let xml = junit(&results);
         let document = roxmltree::Document::parse(&xml).expect("XML");

@@ -16,12 +16,12 @@ const PAIRS_MAX: u64 = 2000;
 const WAITING_MAX: usize = 100_000;
 
 /// Time of arrival, vehicle, sensor, and number among the readings of that time.
-type Key = (i64, String, u16, u32);
+type ReadingKey = (i64, String, u16, u32);
 
 /// The readings of one recording that have no counterpart yet.
-struct Side {
+struct RecordingSide {
     recording: RecordingReader,
-    waiting: BTreeMap<Key, u64>,
+    waiting: BTreeMap<ReadingKey, u64>,
     /// Sequence from which the events of each vehicle are new; earlier ones are repeated for a keyframe.
     next_event: BTreeMap<String, u64>,
     /// Arrival and number of the newest reading of each vehicle and sensor.
@@ -30,7 +30,7 @@ struct Side {
     reached_ns: Option<i64>,
 }
 
-impl Side {
+impl RecordingSide {
     fn open(file: &Path) -> Result<Self> {
         let recording = RecordingReader::open(file)?;
         let (waiting, next_event, newest) = Default::default();
@@ -38,7 +38,7 @@ impl Side {
     }
 
     /// The next reading and the hash of its bytes.
-    fn next(&mut self) -> Result<Option<(Key, u64)>> {
+    fn next(&mut self) -> Result<Option<(ReadingKey, u64)>> {
         for message in self.recording.by_ref() {
             let RecordedMessage::Event { vehicle, event } = message? else { continue };
             let vehicle = vehicle.to_string();
@@ -81,7 +81,7 @@ fn hash_of(event: &Event) -> Option<u64> {
 /// # Errors
 /// If a recording cannot be read, or they are of different drives.
 pub fn check(before: &Path, after: &Path) -> Result<()> {
-    let mut sides = [Side::open(before)?, Side::open(after)?];
+    let mut sides = [RecordingSide::open(before)?, RecordingSide::open(after)?];
     let (mut equal, mut different) = (0_u64, 0_u64);
     // The side that is behind is read next, so that few readings wait for their counterpart.
     while equal + different < PAIRS_MAX

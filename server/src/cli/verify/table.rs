@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::checked::{Check, Checked, Outcome};
+use super::checked::{Check, CheckOutcome, Checked};
 use super::report::reason;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::counted;
@@ -22,29 +22,28 @@ pub fn text(results: &[Checked], check: &Check) -> String {
         let name = result.file.display().to_string();
         let none = || [String::new(), String::new(), String::new(), String::new()];
         let [events, maps, layers, cells] = match &result.outcome {
-            Outcome::Verified(report) => {
+            CheckOutcome::Verified(report) => {
                 [report.events, report.maps, report.equal, report.cells].map(|count| count.to_string())
             }
-            Outcome::Compared(comparison) => {
+            CheckOutcome::Compared(comparison) => {
                 let sum = |of: fn(&LayerChange) -> u64| comparison.layers.values().map(of).sum::<u64>().to_string();
                 [String::new(), String::new(), sum(|layer| layer.maps), sum(|layer| layer.cells)]
             }
-            Outcome::Unreadable(_) => none(),
+            CheckOutcome::Unreadable(_) => none(),
         };
         write_line(&mut text, width, [name, events, maps, layers, cells], &reason(&result.outcome));
         match &result.outcome {
-            Outcome::Verified(report) => {
+            CheckOutcome::Verified(report) => {
                 report.differences.iter().skip(1).for_each(|other| _ = writeln!(text, "  {other}"));
             }
-            Outcome::Compared(comparison) => write_changes(&mut text, comparison),
-            Outcome::Unreadable(_) => {}
+            CheckOutcome::Compared(comparison) => write_changes(&mut text, comparison),
+            CheckOutcome::Unreadable(_) => {}
         }
-        result.pictures.iter().for_each(|picture| _ = writeln!(text, "  picture {}", picture.display()));
     }
     let good = results.iter().filter(|result| result.is_good()).count();
     let different = results.iter().filter(|result| result.exit() == Exit::Differs).count();
     let cut = results.iter().filter(|result| result.is_equal_but_not_whole()).count();
-    let is_compared = |result: &Checked| matches!(&result.outcome, Outcome::Verified(report) if report.equal > 0);
+    let is_compared = |result: &Checked| matches!(&result.outcome, CheckOutcome::Verified(report) if report.equal > 0);
     let what = match check {
         Check::Verify if !results.iter().any(is_compared) => "no map was compared",
         Check::Verify => "every map is the map of its events",
@@ -102,7 +101,7 @@ fn write_changes(text: &mut String, comparison: &Comparison) {
             "  sequence {}, {} {}: {:.2} % of the cells changed, {:.1} m2 gained, {:.1} m2 lost",
             map.sequence,
             map.vehicle,
-            map.after.name,
+            map.layer,
             100.0 * map.share(),
             map.gained_m2,
             map.lost_m2
