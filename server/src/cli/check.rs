@@ -29,7 +29,7 @@ const HEAD: &str = "# Every value that this configuration has. A comment says wh
   clearway check --config clearway.toml
   clearway check --config fleet.toml --vehicle car3
   clearway check --set grpc.listen=0.0.0.0:50051")]
-pub struct Options {
+pub struct CheckArguments {
     /// Print the default configuration, in which every key and every optional table is explained.
     #[arg(long, conflicts_with_all = ["config", "set"])]
     default: bool,
@@ -42,8 +42,8 @@ pub struct Options {
 /// # Errors
 /// [`ConfigError`](clearway_daemon::config::ConfigError), also for a calibration or a certificate that the file names; an error
 /// of certificates that do not fit or of the file of `[zenoh]`.
-pub fn run(options: &Options) -> Result<()> {
-    let Options { default, configuration } = options;
+pub fn run(options: &CheckArguments) -> Result<()> {
+    let CheckArguments { default, configuration } = options;
     if *default {
         print(COMMENTED)?;
         return Ok(());

@@ -12,7 +12,7 @@ use crate::cli::shared::output::print;
   clearway completions bash > ~/.local/share/bash-completion/completions/clearway
   clearway completions zsh > ~/.zfunc/_clearway
   clearway completions fish > ~/.config/fish/completions/clearway.fish")]
-pub struct Options {
+pub struct CompletionsArguments {
     /// The shell.
     shell: Shell,
 }
@@ -21,7 +21,7 @@ pub struct Options {
 ///
 /// # Errors
 /// As [`print()`].
-pub fn run(options: &Options, mut command: Command) -> Result<()> {
+pub fn run(options: &CompletionsArguments, mut command: Command) -> Result<()> {
     let mut script = Vec::new();
     clap_complete::generate(options.shell, &mut command, "clearway", &mut script);
     print(&String::from_utf8_lossy(&script))?;

@@ -1,70 +1,78 @@
 //! The options that name a server and the certificates to reach it -> a connected client.
 
-use std::path::PathBuf;
+use std::ffi::OsString;
+use std::path::Path;
 
 use anyhow::{Error, Result};
 use clap::Args;
 use clearway_client::{Client, ClientError, Tls};
 
 use crate::cli::shared::files;
+use crate::cli::shared::output::usage_error;
 
 /// The gRPC address of a server with the default configuration.
 const ADDRESS: &str = "localhost:50051";
+/// The environment variables that name certificates.
+const VARIABLES: &str = "CLEARWAY_CA, CLEARWAY_CERT and CLEARWAY_KEY name PEM files";
 
-/// The options that name a server and the certificates to reach it.
+/// The server of a client. `CLEARWAY_CA` names the PEM file of the CA certificate that signed the server's certificate,
+/// and turns on encryption; `CLEARWAY_CERT` and `CLEARWAY_KEY` name this client's certificate and its private key.
 #[derive(Args)]
 pub struct ServerOptions {
-    /// The server's gRPC address.
+    /// The server's gRPC address; the environment variables CLEARWAY_CA, CLEARWAY_CERT and CLEARWAY_KEY name PEM files
+    /// of certificates, which encrypt the connection.
     #[arg(long = "server", global = true, value_name = "HOST:PORT", default_value = ADDRESS, env = "CLEARWAY_SERVER")]
     pub address: String,
-    /// PEM file with the CA certificate that signed the server's certificate; turns on encryption.
-    #[arg(long, global = true, value_name = "FILE.pem", env = "CLEARWAY_CA")]
-    ca: Option<PathBuf>,
-    /// PEM file with this client's certificate, if the server requires one.
-    #[arg(long, global = true, value_name = "FILE.pem", env = "CLEARWAY_CERT", requires_all = ["ca", "key"])]
-    cert: Option<PathBuf>,
-    /// PEM file with the private key of --cert.
-    #[arg(long, global = true, value_name = "FILE.key", env = "CLEARWAY_KEY", requires = "cert")]
-    key: Option<PathBuf>,
 }
 
 impl ServerOptions {
-    /// Connects to the server, with certificates if `--ca` is given.
+    /// Connects to the server, with certificates if `CLEARWAY_CA` names one.
     ///
     /// # Errors
     /// If a PEM file cannot be read, and as [`Client::connect`].
     pub async fn connect(&self) -> Result<Client> {
-        match self.tls()? {
+        match tls()? {
             None => Client::connect(&self.address).await.map_err(explain),
             Some(tls) => Client::connect_tls(&self.address, &tls).await.map_err(explain),
         }
     }
 
-    /// Connects to a router or server over zenoh, with certificates if `--ca` is given.
+    /// Connects to a router or server over zenoh, with certificates if `CLEARWAY_CA` names one.
     ///
     /// # Errors
     /// If a PEM file cannot be read, and as [`ZenohClient::connect`](clearway_client::ZenohClient::connect).
     #[cfg(feature = "zenoh")]
     pub async fn connect_over_zenoh(&self, endpoint: &str) -> Result<clearway_client::ZenohClient> {
-        let connected = match self.tls()? {
+        let connected = match tls()? {
             None => clearway_client::ZenohClient::connect(endpoint).await,
             Some(tls) => clearway_client::ZenohClient::connect_tls(endpoint, &tls).await,
         };
-        let advice = |error: ClientError| match endpoint.contains("tls/") && self.cert.is_none() {
-            true => Error::from(error).context("a router of a fleet requires a certificate: --ca, --cert and --key"),
+        let advice = |error: ClientError| match endpoint.contains("tls/") && std::env::var_os("CLEARWAY_CERT").is_none()
+        {
+            true => Error::from(error).context(format!("a router of a fleet requires a certificate: {VARIABLES}")),
             false => Error::from(error),
         };
         connected.map_err(advice)
     }
+}
 
-    fn tls(&self) -> Result<Option<Tls>> {
-        let read = |file: &PathBuf| files::read_text(file);
-        let Some(ca) = &self.ca else { return Ok(None) };
-        let identity = match (&self.cert, &self.key) {
-            (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
-            _ => None,
-        };
-        Ok(Some(Tls { ca: read(ca)?, identity, server_name: String::new() }))
+/// The certificates that the environment variables name; `None` without a CA: the connection is not encrypted then.
+fn tls() -> Result<Option<Tls>> {
+    let [ca, certificate, key] = ["CLEARWAY_CA", "CLEARWAY_CERT", "CLEARWAY_KEY"].map(std::env::var_os);
+    let read = |file: OsString| files::read_text(Path::new(&file));
+    let identity = match (certificate, key) {
+        (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
+        (None, None) => None,
+        _ => {
+            return Err(usage_error(
+                "CLEARWAY_CERT and CLEARWAY_KEY: a certificate needs its key, and a key its certificate",
+            ));
+        }
+    };
+    match ca {
+        Some(ca) => Ok(Some(Tls { ca: read(ca)?, identity, server_name: String::new() })),
+        None if identity.is_some() => Err(usage_error("CLEARWAY_CERT needs CLEARWAY_CA")),
+        None => Ok(None),
     }
 }
 
@@ -89,22 +97,22 @@ fn advice(error: &str) -> Option<&'static str> {
         );
     }
     if error.contains("CertificateRequired") {
-        return Some("the server requires a certificate: --cert and --key");
+        return Some("the server requires a certificate: CLEARWAY_CERT and CLEARWAY_KEY name it and its key");
     }
     if ["CertificateUnknown", "CertificateExpired", "UnknownCA", "BadCertificate"]
         .iter()
         .any(|part| error.contains(part))
     {
         return Some(
-            "the server does not accept the certificate of --cert: its own CA must have signed it, and it must be valid now",
+            "the server does not accept the certificate of CLEARWAY_CERT: its own CA must have signed it, and it must be valid now",
         );
     }
     // A server that refuses a client may close the connection before the alert that says why arrives.
     let ended = ["connection closed", "broken pipe", "operation was canceled", "transport error"];
     if ended.iter().any(|part| error.contains(part)) {
         return Some(
-            "the connection has ended: the server has stopped, encrypts (--ca), requires a certificate (--cert and --key) \
-             or does not accept this one, or has another port for gRPC",
+            "the connection has ended: the server has stopped, encrypts (CLEARWAY_CA), requires a certificate (CLEARWAY_CERT and \
+             CLEARWAY_KEY) or does not accept this one, or has another port for gRPC",
         );
     }
     let has_no_map = error.contains("no map");
@@ -125,7 +133,7 @@ mod tests {
         assert!(advice(error).unwrap().contains("[page] listen"));
         assert!(advice("no clearway server answers at http://localhost:1: Connection refused").is_none());
         let error = "no clearway server answers at https://localhost:1: received fatal alert: CertificateRequired";
-        assert!(advice(error).unwrap().contains("--cert and --key"));
+        assert!(advice(error).unwrap().contains("CLEARWAY_CERT and CLEARWAY_KEY"));
         let error = "no clearway server answers at https://localhost:1: received fatal alert: CertificateUnknown";
         assert!(advice(error).unwrap().contains("does not accept the certificate"));
         let error = "no clearway server answers at https://localhost:1: connection closed";

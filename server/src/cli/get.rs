@@ -31,7 +31,7 @@ const WAIT_MAX: Duration = Duration::from_secs(86_400);
   clearway get --layer drivability --out newest.png
   clearway get --layer occupancy --out newest.npy
   clearway get --json")]
-pub struct Options {
+pub struct GetArguments {
     #[command(flatten)]
     server: ServerOptions,
     /// The vehicle, if the server has several.
@@ -60,7 +60,7 @@ pub struct Options {
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer; if the file cannot be
 /// written.
-pub fn run(options: &Options) -> Result<Exit> {
+pub fn run(options: &GetArguments) -> Result<Exit> {
     let format = options.out.as_deref().map(Format::from_name).transpose()?;
     if let Some(option) = options.drawing.first_given().filter(|_| format != Some(Format::Png)) {
         return Err(usage_error(format!("{option} is for pictures: it needs --out FILE.png")));
@@ -91,8 +91,8 @@ impl Format {
     }
 }
 
-async fn get(options: &Options, format: Option<Format>) -> Result<Exit> {
-    let Options { layer, out, json, drawing, .. } = options;
+async fn get(options: &GetArguments, format: Option<Format>) -> Result<Exit> {
+    let GetArguments { layer, out, json, drawing, .. } = options;
     let map = newest(options).await?;
     let layer = match layer {
         Some(name) => map.layer(name)?,
@@ -129,7 +129,7 @@ async fn get(options: &Options, format: Option<Format>) -> Result<Exit> {
 }
 
 /// The newest map. With `--wait` it is fresh, unless none comes in that time; then the answer of the server holds.
-async fn newest(options: &Options) -> Result<MapView> {
+async fn newest(options: &GetArguments) -> Result<MapView> {
     let limit = Duration::try_from_secs_f64(options.wait.unwrap_or_default());
     let wait = options.wait.unwrap_or_default();
     let limit = limit.map_err(|_| usage_error(format!("--wait={wait}: 0 or more seconds are allowed")))?;
@@ -144,7 +144,7 @@ async fn newest(options: &Options) -> Result<MapView> {
     }
 }
 
-async fn ask(options: &Options) -> Result<MapView> {
+async fn ask(options: &GetArguments) -> Result<MapView> {
     let client = options.server.connect().await?;
     let layers: Vec<String> = options.layer.iter().cloned().collect();
     client.newest(&options.vehicle, &layers).await.map_err(explain)

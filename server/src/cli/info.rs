@@ -30,7 +30,7 @@ use clearway_journal::mcap_reader::{McapReader, Message};
 #[command(after_help = "Examples:
   clearway info drive.mcap
   clearway info drive.pcap --json")]
-pub struct Options {
+pub struct InfoArguments {
     /// The file; its first bytes, or else its name, give its kind.
     file: PathBuf,
     /// Print one JSON object.
@@ -42,7 +42,7 @@ pub struct Options {
 ///
 /// # Errors
 /// If the file cannot be read or its kind is not known.
-pub fn run(options: &Options) -> Result<Exit> {
+pub fn run(options: &InfoArguments) -> Result<Exit> {
     let file = &options.file;
     files::open(file)?;
     let document = match kind(file)? {
@@ -174,7 +174,7 @@ fn grid(message: &Message, layer: &str) -> Result<Value> {
 }
 
 /// One sender of a capture.
-struct Source {
+struct CaptureSender {
     sensor: Sensor,
     /// Number of refused datagrams, by reason.
     refused: BTreeMap<&'static str, u64>,
@@ -182,7 +182,7 @@ struct Source {
 
 fn capture(file: &Path) -> Result<Value> {
     let mut capture = Capture::new(BufReader::new(open_to_read(file)?))?;
-    let mut sources: BTreeMap<SocketAddr, Source> = BTreeMap::new();
+    let mut sources: BTreeMap<SocketAddr, CaptureSender> = BTreeMap::new();
     let (mut packets, mut telemetry, mut other) = (0_u64, 0_u64, 0_u64);
     let mut ports: BTreeMap<String, u64> = BTreeMap::new();
     let mut span: Option<(i64, i64)> = None;
@@ -205,9 +205,10 @@ fn capture(file: &Path) -> Result<Value> {
         }
         // A sensor sends data and telemetry from two ports.
         let sender = SocketAddr::new(datagram.source.ip(), 0);
-        let source = sources
-            .entry(sender)
-            .or_insert_with(|| Source { sensor: Sensor::new(SensorConfig::default()), refused: BTreeMap::new() });
+        let source = sources.entry(sender).or_insert_with(|| CaptureSender {
+            sensor: Sensor::new(SensorConfig::default()),
+            refused: BTreeMap::new(),
+        });
         if let Err(refusal) = source.sensor.push(&datagram.payload, at) {
             *source.refused.entry(refusal.reason()).or_default() += 1;
         }
@@ -234,7 +235,7 @@ fn capture(file: &Path) -> Result<Value> {
     }))
 }
 
-fn sensor(source: &Source) -> Value {
+fn sensor(source: &CaptureSender) -> Value {
     let status = source.sensor.status();
     json!({
         "model": status.model.map(|model| model.spec().name),

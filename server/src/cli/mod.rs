@@ -5,8 +5,6 @@
 mod check;
 mod completions;
 mod connection;
-mod drawing;
-mod fleet;
 mod info;
 mod ingest;
 mod recorder;
@@ -14,8 +12,6 @@ mod recorder;
 mod recordings;
 mod repair;
 mod replay;
-mod replay_state;
-mod screen;
 mod serve;
 mod service_manager;
 mod shared;
@@ -49,11 +45,9 @@ mod simulate;
 #[cfg(feature = "tools")]
 mod tool_commands;
 
-use std::fmt::Write as _;
 use std::process::ExitCode;
 
 use anyhow::Result;
-use clap::builder::StyledStr;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use shared::exit::{EXIT_CODES, Exit};
@@ -63,60 +57,37 @@ use shared::output::{printable, with_causes};
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]
 #[command(name = "clearway", version, after_help = after_help())]
-struct Arguments {
-    /// Format of the log on stderr; the environment variable RUST_LOG, such as RUST_LOG=warn, selects its lines.
-    #[arg(
-        long,
-        value_enum,
-        default_value = "text",
-        global = true,
-        value_name = "text|json",
-        hide_possible_values = true,
-        display_order = 900
-    )]
-    log_format: logs::LogFormat,
+struct ClearwayArguments {
     #[command(subcommand)]
-    command: Command,
+    command: ClearwayCommand,
 }
 
 /// The subcommands, in the order of the help text.
 #[derive(Subcommand)]
-enum Command {
-    Serve(serve::Options),
+enum ClearwayCommand {
+    Serve(serve::ServeArguments),
     Replay(Box<replay::ReplayArguments>),
     View(view::ViewArguments),
-    Transport(transport::Options),
-    Verify(verify::Options),
-    Check(check::Options),
-    Watch(watch::Options),
-    Vehicles(vehicles::Options),
-    Status(status::Options),
-    Top(top::Options),
-    Recorder(recorder::Options),
-    Info(info::Options),
-    Repair(repair::Options),
+    Transport(transport::TransportArguments),
+    Verify(verify::VerifyArguments),
+    Check(check::CheckArguments),
+    Watch(watch::WatchArguments),
+    Vehicles(vehicles::VehiclesArguments),
+    Status(status::StatusArguments),
+    Top(top::TopArguments),
+    Recorder(recorder::RecorderArguments),
+    Info(info::InfoArguments),
+    Repair(repair::RepairArguments),
     #[cfg(feature = "store")]
-    Upload(upload::Options),
+    Upload(upload::UploadArguments),
     #[cfg(feature = "store")]
-    Recordings(recordings::Options),
-    Ingest(ingest::Options),
+    Recordings(recordings::RecordingsArguments),
+    Ingest(ingest::IngestArguments),
     #[cfg(feature = "tools")]
     #[command(flatten)]
     Tool(tool_commands::ToolCommand),
-    Completions(completions::Options),
+    Completions(completions::CompletionsArguments),
 }
-
-/// The subcommands by purpose, as `clearway --help` lists them.
-const GROUPS: [(&str, &[&str]); 8] = [
-    ("Make maps", &["demo", "serve", "replay", "view", "transport"]),
-    ("Check maps and configurations", &["verify", "evaluate", "check", "init"]),
-    ("Read maps from a server", &["watch", "get", "vehicles", "status", "top"]),
-    ("Control a server", &["recorder"]),
-    ("Read files", &["export", "info", "repair"]),
-    ("Keep recordings", &["upload", "recordings"]),
-    ("Send sensor data", &["send", "ingest", "simulate"]),
-    ("Shell", &["completions"]),
-];
 
 /// What the help text says after the options.
 fn after_help() -> String {
@@ -128,12 +99,11 @@ fn after_help() -> String {
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
     let matches = command().try_get_matches();
-    let arguments = match matches.and_then(|matches| Arguments::from_arg_matches(&matches)) {
+    let arguments = match matches.and_then(|matches| ClearwayArguments::from_arg_matches(&matches)) {
         Ok(arguments) => arguments,
         Err(usage) => return print_usage(&usage),
     };
-    logs::start(arguments.log_format);
-    match run(arguments.command) {
+    match logs::start().and_then(|()| run(arguments.command)) {
         Ok(exit) => exit.into(),
         Err(error) => match error.downcast::<clap::Error>() {
             Ok(usage) => print_usage(&usage),
@@ -152,58 +122,40 @@ fn print_usage(usage: &clap::Error) -> ExitCode {
     if usage.use_stderr() { Exit::WrongUse.into() } else { Exit::Good.into() }
 }
 
-fn run(command: Command) -> Result<Exit> {
+fn run(command: ClearwayCommand) -> Result<Exit> {
     match command {
-        Command::Serve(options) => serve::run(&options)?,
-        Command::Replay(options) => return replay::run(*options),
-        Command::View(options) => return view::run(options),
-        Command::Transport(options) => transport::run(&options)?,
-        Command::Verify(options) => return verify::run(&options),
-        Command::Check(options) => check::run(&options)?,
-        Command::Watch(options) => return watch::run(&options),
-        Command::Vehicles(options) => vehicles::run(&options)?,
-        Command::Status(options) => return status::run(&options),
-        Command::Top(options) => top::run(&options)?,
-        Command::Recorder(options) => return recorder::run(options),
-        Command::Info(options) => return info::run(&options),
-        Command::Repair(options) => return repair::run(&options),
+        ClearwayCommand::Serve(options) => serve::run(&options)?,
+        ClearwayCommand::Replay(options) => return replay::run(*options),
+        ClearwayCommand::View(options) => return view::run(options),
+        ClearwayCommand::Transport(options) => transport::run(&options)?,
+        ClearwayCommand::Verify(options) => return verify::run(&options),
+        ClearwayCommand::Check(options) => check::run(&options)?,
+        ClearwayCommand::Watch(options) => return watch::run(&options),
+        ClearwayCommand::Vehicles(options) => vehicles::run(&options)?,
+        ClearwayCommand::Status(options) => return status::run(&options),
+        ClearwayCommand::Top(options) => top::run(&options)?,
+        ClearwayCommand::Recorder(options) => return recorder::run(options),
+        ClearwayCommand::Info(options) => return info::run(&options),
+        ClearwayCommand::Repair(options) => return repair::run(&options),
         #[cfg(feature = "store")]
-        Command::Upload(options) => return upload::run(&options),
+        ClearwayCommand::Upload(options) => return upload::run(&options),
         #[cfg(feature = "store")]
-        Command::Recordings(options) => return recordings::run(&options),
-        Command::Ingest(options) => ingest::run(&options)?,
+        ClearwayCommand::Recordings(options) => return recordings::run(&options),
+        ClearwayCommand::Ingest(options) => ingest::run(&options)?,
         #[cfg(feature = "tools")]
-        Command::Tool(command) => return tool_commands::run(command),
-        Command::Completions(options) => completions::run(&options, self::command())?,
+        ClearwayCommand::Tool(command) => return tool_commands::run(command),
+        ClearwayCommand::Completions(options) => completions::run(&options, self::command())?,
     }
     Ok(Exit::Good)
 }
 
-/// The command line as clap reads it; its help lists the subcommands by purpose.
+/// The command line as clap reads it.
 fn command() -> clap::Command {
-    let command = Arguments::command();
-    let list = grouped_subcommands(&command);
-    let template = format!("{{about}}\n\n{{usage-heading}} {{usage}}\n{list}\nOptions:\n{{options}}{{after-help}}\n");
+    let command = ClearwayArguments::command();
     let names: Vec<String> = command.get_subcommands().map(|command| command.get_name().to_owned()).collect();
     // `--speed -1` is then a wrong speed and not an unknown option.
     let numbers = |command: clap::Command, name| command.mut_subcommand(name, |c| c.allow_negative_numbers(true));
-    names.into_iter().fold(command, numbers).help_template(StyledStr::from(template))
-}
-
-/// The list of subcommands under the headings of [`GROUPS`]. clap lists them under one heading only.
-fn grouped_subcommands(command: &clap::Command) -> String {
-    let styles = clap::builder::Styles::styled();
-    let (header, literal) = (styles.get_header(), styles.get_literal());
-    let mut list = String::new();
-    for (purpose, names) in GROUPS {
-        // Writing to a string cannot fail.
-        let _ = writeln!(list, "\n{header}{purpose}:{header:#}");
-        for subcommand in names.iter().filter_map(|name| command.find_subcommand(name)) {
-            let about = subcommand.get_about().map(ToString::to_string).unwrap_or_default();
-            let _ = writeln!(list, "  {literal}{:<11}{literal:#}  {about}", subcommand.get_name());
-        }
-    }
-    list
+    names.into_iter().fold(command, numbers)
 }
 
 #[cfg(test)]
@@ -212,20 +164,28 @@ mod tests {
 
     use super::*;
 
+    const OPTIONS_MAX: usize = 150;
+
     #[test]
     fn the_command_line_is_sound() {
         command().debug_assert();
     }
 
+    /// Number of long options of a command and of its subcommands, without `--help` and `--version`.
+    fn long_options(command: &clap::Command) -> usize {
+        let is_counted = |argument: &&clap::Arg| !matches!(argument.get_long(), None | Some("help" | "version"));
+        let own = command.get_arguments().filter(is_counted).count();
+        own + command.get_subcommands().map(long_options).sum::<usize>()
+    }
+
+    /// The number may only fall: an option is one more thing to know, to test and to keep.
     #[test]
-    fn help_lists_every_subcommand_once() {
-        let command = command();
-        let mut defined: Vec<&str> = command.get_subcommands().map(clap::Command::get_name).collect();
-        let grouped = GROUPS.iter().flat_map(|(_, names)| *names).copied();
-        let mut listed: Vec<&str> = grouped.filter(|name| command.find_subcommand(name).is_some()).collect();
-        defined.sort_unstable();
-        listed.sort_unstable();
-        assert_eq!(listed, defined);
+    fn the_command_has_at_most_150_long_options() {
+        let mut command = command();
+        command.build();
+        let of = |command: &clap::Command| format!("{} {}", command.get_name(), long_options(command));
+        let listed: Vec<String> = command.get_subcommands().map(of).collect();
+        assert!(long_options(&command) <= OPTIONS_MAX, "{}: {}", long_options(&command), listed.join(", "));
     }
 
     #[test]

@@ -23,18 +23,18 @@ Examples:
   clearway recorder save --seconds 60 --reason near-miss
   clearway recorder list --json"
 )]
-pub struct Options {
+pub struct RecorderArguments {
     #[command(flatten)]
     server: ServerOptions,
     /// Print one JSON object.
     #[arg(long, global = true)]
     json: bool,
     #[command(subcommand)]
-    request: Request,
+    request: RecorderSubcommand,
 }
 
 #[derive(Clone, Subcommand)]
-enum Request {
+enum RecorderSubcommand {
     /// Record again after a stop.
     Start,
     /// End the recording and close its file.
@@ -60,11 +60,11 @@ enum Request {
 ///
 /// # Errors
 /// If the server cannot be reached or refuses the request.
-pub fn run(options: Options) -> Result<Exit> {
+pub fn run(options: RecorderArguments) -> Result<Exit> {
     block_on(send(options))
 }
 
-async fn send(Options { server, json, request }: Options) -> Result<Exit> {
+async fn send(RecorderArguments { server, json, request }: RecorderArguments) -> Result<Exit> {
     let mut recorder = server.connect().await?.recorder().await?;
     let refused = |status: tonic::Status| match std::error::Error::source(&status) {
         // No answer of the server, but of the connection to it.
@@ -76,12 +76,14 @@ async fn send(Options { server, json, request }: Options) -> Result<Exit> {
         None => Error::msg(status.message().to_owned()),
     };
     let answer = match request {
-        Request::Start => recorder.start(v1::StartRecordingRequest {}).await,
-        Request::Stop => recorder.stop(v1::StopRecordingRequest {}).await,
-        Request::Split => recorder.split(v1::SplitRecordingRequest {}).await,
-        Request::Save { seconds, reason } => recorder.save(v1::SaveRecordingRequest { seconds, reason }).await,
-        Request::Status => recorder.status(v1::RecordingStatusRequest {}).await,
-        Request::List => {
+        RecorderSubcommand::Start => recorder.start(v1::StartRecordingRequest {}).await,
+        RecorderSubcommand::Stop => recorder.stop(v1::StopRecordingRequest {}).await,
+        RecorderSubcommand::Split => recorder.split(v1::SplitRecordingRequest {}).await,
+        RecorderSubcommand::Save { seconds, reason } => {
+            recorder.save(v1::SaveRecordingRequest { seconds, reason }).await
+        }
+        RecorderSubcommand::Status => recorder.status(v1::RecordingStatusRequest {}).await,
+        RecorderSubcommand::List => {
             let parts = recorder.list(v1::ListRecordingsRequest {}).await.map_err(refused)?.into_inner().parts;
             print_parts(&parts, json)?;
             return Ok(Exit::Good);

@@ -1,9 +1,10 @@
 //! `clearway recordings`: a store and a search -> the parts that it finds.
 
+use std::time::UNIX_EPOCH;
+
 use anyhow::{Error, Result};
 use clap::Args;
 use serde_json::json;
-use toml::value::{Datetime, Offset};
 
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line};
@@ -17,7 +18,7 @@ use clearway_journal::damage::utc;
 #[command(after_help = "Examples:
   clearway recordings --store /mnt/archive
   clearway recordings --store s3://fleet/clearway --vehicle car --from 2026-01-01T12:00:00Z --near 120,-35")]
-pub struct Options {
+pub struct RecordingsArguments {
     /// The store: a folder, also as file:///FOLDER, or s3://BUCKET/PREFIX with the environment variables of the AWS
     /// tools.
     #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
@@ -49,7 +50,7 @@ pub struct Options {
 ///
 /// # Errors
 /// If the store's URL is wrong or it does not answer.
-pub fn run(options: &Options) -> Result<Exit> {
+pub fn run(options: &RecordingsArguments) -> Result<Exit> {
     let wanted = Search {
         vehicle: options.vehicle.clone(),
         from_ns: options.from,
@@ -98,21 +99,9 @@ fn line(entry: &Entry) -> String {
 
 /// A time such as `2026-01-01T12:00:00Z`, as ns since the Unix epoch.
 fn time_ns(text: &str) -> Result<u64, String> {
-    let wrong = || "a time such as 2026-01-01T12:00:00Z, of 1970 or later, is allowed".to_owned();
-    let Datetime { date, time, offset } = text.parse().map_err(|_| wrong())?;
-    let (date, time) = (date.ok_or_else(wrong)?, time.ok_or_else(wrong)?);
-    let offset_minutes = match offset.ok_or_else(wrong)? {
-        Offset::Z => 0,
-        Offset::Custom { minutes } => i64::from(minutes),
-    };
-    // Days since the epoch of a date in the Gregorian calendar; the year begins in March, so that a leap day ends it.
-    let (year, month) = (i64::from(date.year) - i64::from(date.month <= 2), (i64::from(date.month) + 9) % 12);
-    let days = 365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + i64::from(date.day) - 719_469;
-    let minutes = (days * 24 + i64::from(time.hour)) * 60 + i64::from(time.minute) - offset_minutes;
-    let seconds = minutes * 60 + i64::from(time.second.unwrap_or_default());
-    let ns =
-        seconds.checked_mul(1_000_000_000).and_then(|ns| ns.checked_add(time.nanosecond.unwrap_or_default().into()));
-    ns.and_then(|ns| ns.try_into().ok()).ok_or_else(wrong)
+    let time = humantime::parse_rfc3339(text).ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+    let ns = time.and_then(|since| u64::try_from(since.as_nanos()).ok());
+    ns.ok_or_else(|| "a time such as 2026-01-01T12:00:00Z, of 1970 or later, is allowed".to_owned())
 }
 
 fn place(text: &str) -> Result<(f64, f64), String> {
@@ -125,10 +114,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_time_is_read_with_its_offset() {
+    fn a_time_is_read_in_utc() {
         assert_eq!(time_ns("1970-01-01T00:00:00Z"), Ok(0));
         assert_eq!(time_ns("2026-01-01T12:00:00Z"), Ok(1_767_268_800_000_000_000));
-        assert_eq!(time_ns("2024-02-29T13:30:00.5+01:30"), Ok(1_709_208_000_500_000_000));
+        assert_eq!(time_ns("2024-02-29T12:00:00.5Z"), Ok(1_709_208_000_500_000_000));
         for wrong in ["", "2026-01-01", "12:00:00Z", "2026-01-01T12:00:00", "1969-12-31T23:59:59Z"] {
             assert!(time_ns(wrong).is_err(), "{wrong}");
         }

@@ -21,7 +21,7 @@ use clearway_journal::repair::repair;
 Example:
   clearway repair damaged.mcap repaired.mcap"
 )]
-pub struct Options {
+pub struct RepairArguments {
     /// The damaged file: MCAP of any program, or a ROS 2 bag in sqlite.
     input: PathBuf,
     /// The new file.
@@ -36,7 +36,7 @@ pub struct Options {
 /// # Errors
 /// [`RepairError`](clearway_journal::repair::RepairError) if the file cannot be read, has no message that can be read, or
 /// the new file cannot be written.
-pub fn run(options: &Options) -> Result<Exit> {
+pub fn run(options: &RepairArguments) -> Result<Exit> {
     let report = repair(&options.input, &options.output)?;
     if options.json {
         print_line(&format!("{:#}", report.to_json()))?;

@@ -20,7 +20,7 @@ use clearway_daemon::run::{Running, Server, Setup, ShutdownError};
   clearway serve
   clearway serve --config fleet.toml --vehicle car3
   clearway serve --config car.toml --set grpc.listen=0.0.0.0:50051 --set recorder.file=drive.mcap")]
-pub struct Options {
+pub struct ServeArguments {
     #[command(flatten)]
     configuration: ConfigurationOptions,
 }
@@ -30,7 +30,7 @@ pub struct Options {
 /// # Errors
 /// [`ConfigError`](clearway_daemon::config::ConfigError), [`StartError`](clearway_daemon::run::StartError), and
 /// [`ShutdownError`](clearway_daemon::run::ShutdownError) at the end.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &ServeArguments) -> Result<()> {
     let held = HeldSockets::from_environment().context("LISTEN_FDS: a socket of the service manager")?;
     block_on(serve(&options.configuration, held))
 }

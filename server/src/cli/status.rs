@@ -18,7 +18,7 @@ use clearway_daemon::status::{State, vehicle_json};
   clearway status
   clearway status car --json
   clearway status --server vehicle.local:50051 || echo \"look at the vehicle\"")]
-pub struct Options {
+pub struct StatusArguments {
     #[command(flatten)]
     server: ServerOptions,
     /// The vehicles; all if absent.
@@ -33,11 +33,11 @@ pub struct Options {
 ///
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer; if a vehicle is unknown.
-pub fn run(options: &Options) -> Result<Exit> {
+pub fn run(options: &StatusArguments) -> Result<Exit> {
     block_on(status(options))
 }
 
-async fn status(options: &Options) -> Result<Exit> {
+async fn status(options: &StatusArguments) -> Result<Exit> {
     let all = options.server.connect().await?.vehicles().await.map_err(explain)?;
     if let Some(unknown) = options.vehicles.iter().find(|name| !all.iter().any(|vehicle| vehicle.name == **name)) {
         let known = all.iter().map(|vehicle| vehicle.name.as_str()).collect::<Vec<_>>().join(", ");

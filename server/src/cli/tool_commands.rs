@@ -12,7 +12,7 @@ pub enum ToolCommand {
     Demo(demo::DemoArguments),
     Evaluate(evaluate::EvaluateArguments),
     Init(init::InitArguments),
-    Get(get::Options),
+    Get(get::GetArguments),
     Export(export::ExportArguments),
     Send(send::SendArguments),
     Simulate(simulate::SimulateArguments),

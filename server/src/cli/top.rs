@@ -3,13 +3,12 @@
 use anyhow::Result;
 use clap::Args;
 use clearway_client::{Client, v1};
-use console::{Alignment, Style, measure_text_width, pad_str, truncate_str};
+use console::{Alignment, Style, Term, measure_text_width, pad_str, truncate_str};
 use futures::StreamExt;
 
 use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::fleet::{is_of_several_servers, server_text};
-use crate::cli::screen::Screen;
-use crate::cli::shared::output::{self, block_on, counted, stop_signal};
+use crate::cli::shared::output::{self, block_on, counted, print, stop_signal};
+use crate::cli::vehicles::{is_of_several_servers, server_text};
 
 /// Widest column of servers, in characters.
 const SERVER_COLUMNS_MAX: usize = 32;
@@ -24,7 +23,7 @@ const SERVER_COLUMNS_MAX: usize = 32;
   clearway top
   clearway top car truck --server fleet.local:50051
   clearway top --count 1")]
-pub struct Options {
+pub struct TopArguments {
     #[command(flatten)]
     server: ServerOptions,
     /// The vehicles; all if absent.
@@ -39,7 +38,7 @@ pub struct Options {
 ///
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &TopArguments) -> Result<()> {
     let screen = Screen::new();
     screen.set_cursor(false)?;
     let ended = block_on(show(options, &screen));
@@ -47,7 +46,7 @@ pub fn run(options: &Options) -> Result<()> {
     ended
 }
 
-async fn show(options: &Options, screen: &Screen) -> Result<()> {
+async fn show(options: &TopArguments, screen: &Screen) -> Result<()> {
     let stop = stop_signal()?;
     let client = options.server.connect().await?;
     let mut updates = client.watch_status(&[]).await.map_err(explain)?;
@@ -171,6 +170,58 @@ fn age(ms: f64) -> String {
 /// The text on one line.
 fn printable(text: &str) -> String {
     output::printable(text).replace(['\n', '\t'], "\u{fffd}")
+}
+
+/// Rows and columns where stdout is no terminal.
+const SCREEN_SIZE: (usize, usize) = (50, 120);
+
+/// Stdout, as a screen.
+struct Screen(Term);
+
+impl Screen {
+    /// The screen of this process.
+    fn new() -> Self {
+        Self(Term::stdout())
+    }
+
+    /// True if stdout is a terminal.
+    fn is_live(&self) -> bool {
+        self.0.is_term()
+    }
+
+    /// Number of rows that [`Screen::show`] can show, and number of columns.
+    fn size(&self) -> (usize, usize) {
+        if !self.is_live() {
+            return SCREEN_SIZE;
+        }
+        let (rows, columns) = self.0.size();
+        // The last row stays free, so that the terminal does not scroll.
+        (usize::from(rows).saturating_sub(1), columns.into())
+    }
+
+    /// Shows `lines` in place of those before; elsewhere than on a terminal an empty line follows them. `false` if the
+    /// reader of stdout has closed it.
+    fn show(&self, lines: &[String]) -> Result<bool> {
+        if !self.is_live() {
+            return print(&format!("{}\n\n", lines.join("\n")));
+        }
+        let lines = &lines[..lines.len().min(self.size().0)];
+        let text: String = lines.iter().map(|line| format!("{line}\x1b[K\r\n")).collect();
+        self.0.move_cursor_to(0, 0)?;
+        self.0.write_str(&text)?;
+        self.0.clear_to_end_of_screen()?;
+        Ok(true)
+    }
+
+    /// Hides the cursor of a terminal, or shows it again.
+    fn set_cursor(&self, is_visible: bool) -> Result<()> {
+        if self.is_live() && is_visible {
+            self.0.show_cursor()?;
+        } else if self.is_live() {
+            self.0.hide_cursor()?;
+        }
+        Ok(())
+    }
 }
 
 #[cfg(test)]

@@ -3,11 +3,11 @@
 use anyhow::{Result, bail};
 use clap::{ArgAction, Args, Subcommand};
 use clearway_client::ClientError;
-use clearway_client::v1::{ReplayControl, ReplayState};
+use clearway_client::v1::{ReplayControl, ReplayPhase, ReplayState};
+use serde_json::json;
 
 use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::replay::offset;
-use crate::cli::replay_state as state;
 use crate::cli::shared::output::{block_on, print_line, usage_error};
 use clearway_daemon::player::control::STEP_MAX;
 use clearway_daemon::replay::ReplaySpeed;
@@ -22,9 +22,9 @@ use clearway_daemon::replay::ReplaySpeed;
   clearway transport range 2 5
   clearway transport range --all
   clearway transport rate max")]
-pub struct Options {
+pub struct TransportArguments {
     #[command(subcommand)]
-    request: Option<Request>,
+    request: Option<TransportRequest>,
     #[command(flatten)]
     server: ServerOptions,
     /// Print the state as one JSON object.
@@ -34,7 +34,7 @@ pub struct Options {
 
 /// What to change. Times are seconds after the first event.
 #[derive(Clone, Copy, Subcommand)]
-enum Request {
+enum TransportRequest {
     /// Go on.
     Play,
     /// Stop until `play`.
@@ -95,8 +95,8 @@ fn on_or_off(text: &str) -> Result<bool, String> {
 ///
 /// # Errors
 /// If the server does not answer, serves no replay, or refuses the change.
-pub fn run(options: &Options) -> Result<()> {
-    if let Some(Request::Range { from: Some(from), to: Some(to), .. }) = options.request
+pub fn run(options: &TransportArguments) -> Result<()> {
+    if let Some(TransportRequest::Range { from: Some(from), to: Some(to), .. }) = options.request
         && from >= to
     {
         return Err(usage_error(format!("range {from} {to}: the range must end after it begins")));
@@ -104,7 +104,7 @@ pub fn run(options: &Options) -> Result<()> {
     block_on(control(options))
 }
 
-async fn control(options: &Options) -> Result<()> {
+async fn control(options: &TransportArguments) -> Result<()> {
     let client = options.server.connect().await?;
     let replay = match client.replay_control(ReplayControl::default()).await {
         Err(ClientError::Refused { address, code, .. }) if code == "Unimplemented" => {
@@ -116,11 +116,11 @@ async fn control(options: &Options) -> Result<()> {
         None => replay,
         Some(request) => client.replay_control(request.to_control(&replay)).await.map_err(explain)?,
     };
-    print_line(&if options.json { state::json(&replay) } else { state::line(&replay) })?;
+    print_line(&if options.json { document(&replay) } else { line(&replay) })?;
     Ok(())
 }
 
-impl Request {
+impl TransportRequest {
     fn to_control(self, state: &ReplayState) -> ReplayControl {
         // Saturates: what lies outside the drive is refused by the server.
         let at = |seconds: f64| Some(state.begin_ns.saturating_add((seconds * 1e9) as i64));
@@ -139,4 +139,51 @@ impl Request {
             Self::Lockstep { on } => ReplayControl { lockstep: Some(on), ..nothing },
         }
     }
+}
+
+fn phase(state: &ReplayState) -> &'static str {
+    match state.phase() {
+        ReplayPhase::Unspecified => "unknown",
+        ReplayPhase::Waiting => "waiting for readers",
+        ReplayPhase::Playing => "playing",
+        ReplayPhase::Paused => "paused",
+        ReplayPhase::Ended => "ended",
+    }
+}
+
+fn seconds(state: &ReplayState, ns: i64) -> f64 {
+    ns.saturating_sub(state.begin_ns) as f64 * 1e-9
+}
+
+/// The state as a line of text.
+fn line(state: &ReplayState) -> String {
+    let at = |ns| seconds(state, ns);
+    let rate = if state.rate.is_finite() { format!("{}x", state.rate) } else { "max".to_owned() };
+    let flags = [(state.as_live, ", as live"), (state.repeat, ", loop"), (state.lockstep, ", lockstep")];
+    let flags: String = flags.iter().filter(|(is_set, _)| *is_set).map(|(_, text)| *text).collect();
+    let (from, to) = (at(state.from_ns), at(state.to_ns));
+    let newest: Vec<String> = state
+        .vehicles
+        .iter()
+        .zip(&state.maps)
+        .filter(|(_, maps)| **maps > 0)
+        .map(|(vehicle, maps)| format!(", {vehicle} at map {}", maps - 1))
+        .collect();
+    let awaited = if state.awaited.is_empty() { String::new() } else { format!(", waits for {}", state.awaited) };
+    let (newest, position) = (newest.concat(), at(state.position_ns));
+    format!("{} at {position:.3} s of {from:.3} to {to:.3} s{newest}, {rate}{flags}{awaited}", phase(state))
+}
+
+/// The state as a JSON object; times are seconds after the first event.
+fn document(state: &ReplayState) -> String {
+    let at = |ns| seconds(state, ns);
+    json!({
+        "phase": phase(state), "position_s": at(state.position_ns), "from_s": at(state.from_ns),
+        "to_s": at(state.to_ns), "end_s": at(state.end_ns), "begin_ns": state.begin_ns,
+        "rate": if state.rate.is_finite() { json!(state.rate) } else { "max".into() },
+        "loop": state.repeat, "lockstep": state.lockstep, "as_live": state.as_live, "jumps": state.jumps,
+        "readers_awaited": state.readers_awaited, "awaited": state.awaited,
+        "vehicles": state.vehicles, "maps": state.maps,
+    })
+    .to_string()
 }

@@ -25,7 +25,7 @@ const SCAN_PERIOD: Duration = Duration::from_secs(5);
   clearway upload recordings --store s3://fleet/clearway --follow --delete
 
 Exit codes: 0 every part is confirmed, 2 a part is not, 3 wrong use.")]
-pub struct Options {
+pub struct UploadArguments {
     /// The folder with the recordings (.mcap). One that is still being written is left out.
     folder: PathBuf,
     /// The store: a folder, also as file:///FOLDER, or s3://BUCKET/PREFIX with the environment variables of the AWS
@@ -45,11 +45,11 @@ pub struct Options {
 /// # Errors
 /// If the folder cannot be read or the store's URL is wrong. A part that is not confirmed is no error; the output and
 /// the exit code say so.
-pub fn run(options: &Options) -> Result<Exit> {
+pub fn run(options: &UploadArguments) -> Result<Exit> {
     block_on(send(options))
 }
 
-async fn send(options: &Options) -> Result<Exit> {
+async fn send(options: &UploadArguments) -> Result<Exit> {
     // A folder that is not there is an error before the store's is made.
     parts(&options.folder)?;
     let store = location::open(&options.store)?;
@@ -74,7 +74,7 @@ fn parts(folder: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// Sends every finished part; returns the number of those that are not confirmed.
-async fn send_all(options: &Options, store: &dyn ObjectStore) -> Result<u64> {
+async fn send_all(options: &UploadArguments, store: &dyn ObjectStore) -> Result<u64> {
     let mut failed = 0;
     for part in parts(&options.folder)? {
         match upload::upload(store, &part).await {

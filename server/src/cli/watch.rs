@@ -3,28 +3,26 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use clap::Args;
 use clearway_client::{ClientError, MapStream, PassedOver, Staleness, StreamEvent, Subscription, Update, now_ns};
-use console::truncate_str;
 use serde_json::json;
 
 use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::drawing;
-use crate::cli::screen::Screen;
 use crate::cli::shared::exit::Exit;
 #[cfg(feature = "zenoh")]
 use crate::cli::shared::files;
-use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
+use crate::cli::shared::output::{block_on, counted, print_line};
 
 /// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
 const STALE_PERIOD: Duration = Duration::from_secs(1);
-/// The layer that is drawn, and read over zenoh, if none is named.
+/// The layer that is read over zenoh if none is named.
+#[cfg(feature = "zenoh")]
 const DEFAULT_LAYER: &str = "drivability";
 /// Interval at which the age of the last map is read after the stream has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps; or draw each map.
+/// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
 /// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
 /// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream, or if a
@@ -33,14 +31,13 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 #[command(after_help = "Examples:
   clearway watch
   clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 5
-  clearway watch --draw --layers occupancy --range 20
   clearway watch --count 10 --json
   clearway watch --until-stale || echo \"the maps are stale\"")]
-pub struct Options {
+pub struct WatchArguments {
     #[command(flatten)]
     server: ServerOptions,
-    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447; or, with --ca, --cert and
-    /// --key, tls/HOST:7447.
+    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447; or, with
+    /// certificates, tls/HOST:7447.
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
@@ -55,19 +52,9 @@ pub struct Options {
     /// Greatest number of maps a second; every map if absent.
     #[arg(long, value_name = "HZ", conflicts_with = "zenoh")]
     max_rate_hz: Option<f64>,
-    /// Receive only the cells that have changed since the last map.
-    #[arg(long, conflicts_with = "zenoh")]
-    deltas: bool,
     /// Print each line as a JSON object.
-    #[arg(long, conflicts_with = "draw")]
-    json: bool,
-    /// Draw one layer of each map in the terminal; drivability if --layers names none. Elsewhere than in a terminal a
-    /// cell is the first letter of its class.
     #[arg(long)]
-    draw: bool,
-    /// With --draw: distance from the vehicle to the edge, in metres; the whole grid if absent.
-    #[arg(long, value_name = "METRES", requires = "draw")]
-    range: Option<f64>,
+    json: bool,
     /// End after this many maps; at Ctrl-C if absent. If a replay ends before, the exit code is 2.
     #[arg(long, value_name = "MAPS")]
     count: Option<u64>,
@@ -81,19 +68,12 @@ pub struct Options {
 ///
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
-pub fn run(options: &Options) -> Result<Exit> {
+pub fn run(options: &WatchArguments) -> Result<Exit> {
     block_on(watch(options))
 }
 
-async fn watch(options: &Options) -> Result<Exit> {
-    if options.draw && options.layers.len() > 1 {
-        return Err(usage_error(format!("--draw: --layers {}: one layer is allowed", options.layers.join(","))));
-    }
-    if let Some(range_m) = options.range.filter(|range_m| !(*range_m > 0.0 && range_m.is_finite())) {
-        return Err(usage_error(format!("--range {range_m}: more than 0 is allowed")));
-    }
+async fn watch(options: &WatchArguments) -> Result<Exit> {
     let mut maps = subscribe(options).await?;
-    let screen = options.draw.then(Screen::new);
     let mut newest: Option<Update> = None;
     let (mut printed, mut is_stale) = (0, false);
     while options.count.is_none_or(|count| printed < count) && !(is_stale && options.until_stale) {
@@ -133,27 +113,12 @@ async fn watch(options: &Options) -> Result<Exit> {
                 (stale_line(newest.as_ref(), maps.passed_over(), options), false)
             }
         };
-        let goes_on = match &screen {
-            Some(screen) => screen.show(&drawn(newest.as_ref(), said, screen, options)?)?,
-            None => print_line(&said)?,
-        };
-        if !goes_on {
+        if !print_line(&said)? {
             break;
         }
         printed += u64::from(is_new);
     }
     Ok(Exit::from_stale(is_stale))
-}
-
-/// The lines of a drawn map: the newest one, if there is one, and what is said of it.
-fn drawn(newest: Option<&Update>, said: String, screen: &Screen, options: &Options) -> Result<Vec<String>> {
-    let Some(Update { map, .. }) = newest else { return Ok(vec![said]) };
-    let layer = map.layers().first().context("the map has no layer")?;
-    let (rows, columns) = screen.size();
-    let size = (rows.saturating_sub(1), columns);
-    let mut lines = drawing::lines(layer, options.range, size, screen.is_live());
-    lines.push(truncate_str(&said, columns, "…").into_owned());
-    Ok(lines)
 }
 
 /// Identity of a map.
@@ -168,17 +133,15 @@ async fn wait_until_stale(last: &Update) {
     }
 }
 
-async fn subscribe(options: &Options) -> Result<MapStream> {
-    let Options { zenoh, vehicle, layers, max_rate_hz, deltas, .. } = options;
+async fn subscribe(options: &WatchArguments) -> Result<MapStream> {
+    let WatchArguments { zenoh, vehicle, layers, max_rate_hz, .. } = options;
     if let Some(endpoint) = zenoh {
         return subscribe_over_zenoh(endpoint, options).await;
     }
-    let drawn = (options.draw && layers.is_empty()).then(|| vec![DEFAULT_LAYER.to_owned()]);
     let subscription = Subscription {
         vehicle: vehicle.clone().unwrap_or_default(),
-        layers: drawn.unwrap_or_else(|| layers.clone()),
+        layers: layers.clone(),
         max_rate_hz: *max_rate_hz,
-        deltas: *deltas,
         ..Subscription::default()
     };
     options.server.connect().await?.subscribe(subscription).await.map_err(explain)
@@ -214,7 +177,7 @@ fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
 }
 
 /// The line while no fresh map is there: the newest one is stale, or none has come.
-fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Options) -> String {
+fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &WatchArguments) -> String {
     match newest {
         Some(update) if options.json => line(update, passed_over, true),
         Some(Update { map, .. }) => format!(
@@ -232,7 +195,7 @@ fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Option
 }
 
 #[cfg(feature = "zenoh")]
-async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapStream> {
+async fn subscribe_over_zenoh(endpoint: &str, options: &WatchArguments) -> Result<MapStream> {
     let layer = match &options.layers[..] {
         [] => DEFAULT_LAYER,
         [layer] => layer,
@@ -258,6 +221,6 @@ async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapSt
 }
 
 #[cfg(not(feature = "zenoh"))]
-async fn subscribe_over_zenoh(endpoint: &str, _: &Options) -> Result<MapStream> {
+async fn subscribe_over_zenoh(endpoint: &str, _: &WatchArguments) -> Result<MapStream> {
     bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
 }

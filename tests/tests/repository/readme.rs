@@ -147,10 +147,6 @@ fn the_default_configuration_serves_what_send_sends_to_the_readers() {
         succeeds(folder.path(), command);
     }
     shows_a_map(folder.path(), "clearway watch --count 1");
-    let draw =
-        commands().into_iter().find(|c| c.starts_with("clearway watch --draw")).expect("`clearway watch --draw`");
-    let drawn = shows_a_map(folder.path(), &format!("{draw} --count 1"));
-    assert!(drawn.contains("dddd") && drawn.contains("d drivable"), "{drawn}");
     let get = commands().into_iter().find(|c| c.starts_with("clearway get")).expect("the README shows `clearway get`");
     shows_a_map(folder.path(), &get);
     assert!(folder.path().join("newest.png").is_file());

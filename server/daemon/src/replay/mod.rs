@@ -43,7 +43,7 @@ pub mod summary;
 
 pub use error::ReplayError;
 pub use options::{ReplayOptions, ReplaySpeed, ServedReplay};
-use plan::{Plan, plan};
+use plan::{ReplayPlan, plan};
 use ready_file::ReadyFile;
 use summary::why_no_map;
 pub use summary::{Mount, ReplaySummary, describe};
@@ -91,7 +91,8 @@ impl ReplayRun {
         let served = options.served.as_ref();
         let ready_file = served.and_then(|served| served.ready_file.as_deref());
         ready_file.map_or(Ok(()), ReadyFile::prepare)?;
-        let Plan { setup, mount, extrinsics, mut timeline, bytes } = tokio::task::block_in_place(|| plan(&options))?;
+        let ReplayPlan { setup, mount, extrinsics, mut timeline, bytes } =
+            tokio::task::block_in_place(|| plan(&options))?;
         let extent = tokio::task::block_in_place(|| extent(&options, &timeline))?;
         let mut state = initial_state(&options, extent)?;
         state.vehicles = setup.config.vehicles.iter().map(|vehicle| vehicle.name.clone()).collect();

@@ -33,7 +33,7 @@ use crate::run::Setup;
 use clearway_journal::reader::RecordingReader;
 
 /// What is known before the first event.
-pub(super) struct Plan {
+pub(super) struct ReplayPlan {
     pub(super) setup: Setup,
     pub(super) mount: Mount,
     pub(super) extrinsics: Extrinsics,
@@ -46,7 +46,7 @@ pub(super) struct Plan {
 ///
 /// # Errors
 /// [`ReplayError`] if a file, a recording or the configuration cannot be used.
-pub(super) fn plan(options: &ReplayOptions) -> Result<Plan, ReplayError> {
+pub(super) fn plan(options: &ReplayOptions) -> Result<ReplayPlan, ReplayError> {
     let files = Readings::open(&options.files, McapOptions::default())?;
     let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
     let journal = match &recorded {
@@ -93,11 +93,11 @@ pub(super) fn plan(options: &ReplayOptions) -> Result<Plan, ReplayError> {
     let setup = known.setup(options)?;
     let tracks = vec![Track { files: options.files.clone(), options: wanted }];
     let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
-    Ok(Plan { setup, mount, extrinsics, timeline, bytes })
+    Ok(ReplayPlan { setup, mount, extrinsics, timeline, bytes })
 }
 
 /// The plan of several vehicles in one recorded time. The files of one vehicle follow each other.
-fn plan_several(options: &ReplayOptions, recordings: Vec<Recorded>, bytes: u64) -> Result<Plan, ReplayError> {
+fn plan_several(options: &ReplayOptions, recordings: Vec<Recorded>, bytes: u64) -> Result<ReplayPlan, ReplayError> {
     let given = [("--extrinsics", options.extrinsics.is_some()), ("--model", options.model.is_some())];
     if let Some((option, _)) = given.iter().find(|(_, is_given)| *is_given) {
         let reason = "the recordings have several vehicles; name one with --vehicle".to_owned();
@@ -106,7 +106,7 @@ fn plan_several(options: &ReplayOptions, recordings: Vec<Recorded>, bytes: u64) 
     let boot_ids: BTreeSet<u64> = recordings.iter().map(|recording| recording.boot_id).collect();
     let boot_id = boot_ids.first().copied().filter(|_| boot_ids.len() == 1);
     let config = Config { vehicles: Vec::new(), ..Config::default() };
-    let mut known = Known { config, tables: Vec::new(), boot_id, is_mounted: true, remarks: Vec::new() };
+    let mut known = KnownVehicle { config, tables: Vec::new(), boot_id, is_mounted: true, remarks: Vec::new() };
     let mut tracks: Vec<Track> = Vec::new();
     for Recorded { file, config, tables, .. } in recordings {
         for (mut vehicle, tables) in config.vehicles.into_iter().zip(tables) {
@@ -131,7 +131,7 @@ fn plan_several(options: &ReplayOptions, recordings: Vec<Recorded>, bytes: u64) 
     let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
     let setup = known.setup(options)?;
     let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
-    Ok(Plan { setup, mount: Mount::Given, extrinsics, timeline, bytes })
+    Ok(ReplayPlan { setup, mount: Mount::Given, extrinsics, timeline, bytes })
 }
 
 /// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a
@@ -183,7 +183,7 @@ fn check_record(files: &[PathBuf], record: &Path) -> Result<(), ReplayError> {
 }
 
 /// What is known about the vehicle so far.
-struct Known {
+struct KnownVehicle {
     /// The configuration, with one vehicle.
     config: Config,
     tables: Calibrations,
@@ -195,7 +195,7 @@ struct Known {
     remarks: Vec<String>,
 }
 
-impl Known {
+impl KnownVehicle {
     /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor
     /// if tf has it.
     fn apply_bag(
@@ -320,9 +320,9 @@ fn origin(options: &ReplayOptions, file: &Path) -> Origin {
 }
 
 /// The configuration of `--config`, else of the recording, else the default one.
-fn configured(options: &ReplayOptions, recorded: Option<&Path>) -> Result<Known, ReplayError> {
+fn configured(options: &ReplayOptions, recorded: Option<&Path>) -> Result<KnownVehicle, ReplayError> {
     let known =
-        |config, tables, boot_id, is_mounted| Known { config, tables, boot_id, is_mounted, remarks: Vec::new() };
+        |config, tables, boot_id, is_mounted| KnownVehicle { config, tables, boot_id, is_mounted, remarks: Vec::new() };
     let pick = |file: &Path, config: &mut Config, tables: &mut Calibrations| {
         let known = || config.vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", ");
         let index = match &options.vehicle {

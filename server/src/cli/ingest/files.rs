@@ -63,9 +63,9 @@ fn origin(text: &str) -> Result<[f64; 2], String> {
 }
 
 /// What is sent, and when.
-pub struct Plan {
+pub struct IngestPlan {
     /// Scans, poses and roads, ordered by stamp.
-    pub items: Vec<(i64, Item)>,
+    pub items: Vec<(i64, IngestItem)>,
     /// Captures, whose datagrams have stamps of their own.
     pub drives: Vec<PathBuf>,
     /// Lines of road files that are left out, and why.
@@ -73,7 +73,7 @@ pub struct Plan {
 }
 
 /// One observation to send.
-pub enum Item {
+pub enum IngestItem {
     /// Position in the map frame in metres, quaternion x y z w, forward speed in m/s.
     Pose([f64; 3], [f64; 4], f64),
     /// A road in the map frame.
@@ -82,7 +82,7 @@ pub enum Item {
     Scan(PathBuf),
 }
 
-impl Item {
+impl IngestItem {
     /// The kind of the item, and its observation.
     ///
     /// # Errors
@@ -114,7 +114,7 @@ fn ending(file: &Path) -> &str {
     file.extension().and_then(|extension| extension.to_str()).unwrap_or("")
 }
 
-impl Plan {
+impl IngestPlan {
     /// Reads poses and roads, and orders what is sent.
     ///
     /// # Errors
@@ -161,19 +161,19 @@ impl Plan {
             Some((stamp_ns, _)) => *stamp_ns,
             None => first_ns.saturating_add((index as f64 * 1e9 / hz) as i64),
         };
-        let scans = scans.into_iter().enumerate().map(|(index, file)| (stamp_ns(index), Item::Scan(file)));
+        let scans = scans.into_iter().enumerate().map(|(index, file)| (stamp_ns(index), IngestItem::Scan(file)));
         // Each road has a stamp of its own, because the server uses the newest.
-        let roads = (0..).zip(roads).map(|(index, road)| (first_ns.saturating_add(index), Item::Road(road)));
+        let roads = (0..).zip(roads).map(|(index, road)| (first_ns.saturating_add(index), IngestItem::Road(road)));
         let mut items: Vec<_> = roads.chain(scans).collect();
         items.extend(poses);
         // Poses and roads come before the scan of the same stamp, whose map uses them.
-        items.sort_by_key(|(stamp_ns, item)| (*stamp_ns, matches!(item, Item::Scan(_))));
+        items.sort_by_key(|(stamp_ns, item)| (*stamp_ns, matches!(item, IngestItem::Scan(_))));
         Ok(Self { items, drives, notes })
     }
 }
 
 /// Reads lines of "seconds x y z qx qy qz qw". The speed of each pose is that from the pose before it.
-fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
+fn read_poses(text: &str) -> Result<Vec<(i64, IngestItem)>> {
     let mut poses: Vec<(i64, [f64; 7])> = Vec::new();
     for (index, line) in text.lines().enumerate() {
         let line = line.split('#').next().unwrap_or("").trim();
@@ -201,7 +201,7 @@ fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
     let item = |index: usize| {
         let (stamp_ns, [x, y, z, qx, qy, qz, qw]) = poses[index];
         let (from, to) = if index > 0 { (index - 1, index) } else { (0, 1.min(poses.len() - 1)) };
-        (stamp_ns, Item::Pose([x, y, z], [qx, qy, qz, qw], speed_mps(&poses[from], &poses[to])))
+        (stamp_ns, IngestItem::Pose([x, y, z], [qx, qy, qz, qw], speed_mps(&poses[from], &poses[to])))
     };
     Ok((0..poses.len()).map(item).collect())
 }
@@ -230,19 +230,19 @@ fn read_road(text: &str, ending: &str, options: &FileOptions) -> (Result<Road>, 
 }
 
 /// Datagrams with their stamps, in nanoseconds since the Unix epoch.
-type Packets = Vec<(i64, Vec<u8>)>;
+type StampedPackets = Vec<(i64, Vec<u8>)>;
 
 /// The datagrams of a capture, in groups that make one observation each. A capture that is cut off gives those before
 /// the cut.
 ///
 /// # Errors
 /// If the file cannot be read.
-pub fn chunks(file: &Path) -> Result<impl Iterator<Item = Result<Packets, CaptureError>>> {
+pub fn chunks(file: &Path) -> Result<impl Iterator<Item = Result<StampedPackets, CaptureError>>> {
     let (opened, _) = files::open(file)?;
     let capture = Capture::new(BufReader::new(opened)).with_context(|| file.display().to_string())?;
     let mut datagrams = capture.peekable();
     Ok(std::iter::from_fn(move || {
-        let mut packets = Packets::new();
+        let mut packets = StampedPackets::new();
         while packets.len() < PACKETS {
             let first_ns = packets.first().map(|(stamp_ns, _)| *stamp_ns);
             let near =
@@ -264,23 +264,23 @@ mod tests {
     use super::*;
 
     #[derive(Parser)]
-    struct Arguments {
+    struct TestArguments {
         #[command(flatten)]
         options: FileOptions,
     }
 
-    fn plan(folder: &Path, files: &[(&str, &[u8])]) -> Result<Plan> {
+    fn plan(folder: &Path, files: &[(&str, &[u8])]) -> Result<IngestPlan> {
         plan_with(folder, files, &[])
     }
 
-    fn plan_with(folder: &Path, files: &[(&str, &[u8])], options: &[&str]) -> Result<Plan> {
+    fn plan_with(folder: &Path, files: &[(&str, &[u8])], options: &[&str]) -> Result<IngestPlan> {
         let mut arguments = vec!["ingest".to_owned()];
         arguments.extend(options.iter().map(|&option| option.to_owned()));
         for (name, bytes) in files {
             std::fs::write(folder.join(name), bytes).unwrap();
             arguments.push(folder.join(name).display().to_string());
         }
-        Plan::new(&Arguments::parse_from(arguments).options)
+        IngestPlan::new(&TestArguments::parse_from(arguments).options)
     }
 
     #[test]
@@ -290,10 +290,10 @@ mod tests {
         let rddf = b"1,30.0,-97.0,10,20\n2,30.001,-97.0,10,20\nthree,1,2\n";
         let files: [(&str, &[u8]); 4] = [("a.bin", &[0; 16]), ("b.bin", &[0; 16]), ("p.tum", poses), ("r.rddf", rddf)];
         let plan = plan(folder.path(), &files).unwrap();
-        let kind = |item: &Item| match item {
-            Item::Pose(..) => "pose",
-            Item::Road(_) => "road",
-            Item::Scan(_) => "scan",
+        let kind = |item: &IngestItem| match item {
+            IngestItem::Pose(..) => "pose",
+            IngestItem::Road(_) => "road",
+            IngestItem::Scan(_) => "scan",
         };
         let kinds: Vec<_> = plan.items.iter().map(|(stamp_ns, item)| (*stamp_ns, kind(item))).collect();
         let half = 500_000_000;
@@ -301,7 +301,7 @@ mod tests {
         assert_eq!(kinds[..4], expected);
         assert_eq!(kinds[4..], [(4 * half, "scan"), (5 * half, "pose")]);
         let speeds = plan.items.iter().filter_map(|(_, item)| match item {
-            Item::Pose(_, _, speed_mps) => Some(*speed_mps),
+            IngestItem::Pose(_, _, speed_mps) => Some(*speed_mps),
             _ => None,
         });
         // The vehicle faces -x: it drives forward to -4 m, and then backward to -3 m.

@@ -14,7 +14,7 @@ use serde_json::json;
 
 use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
-use files::{FileOptions, Item, Plan};
+use files::{FileOptions, IngestItem, IngestPlan};
 
 mod files;
 
@@ -27,12 +27,12 @@ mod files;
 #[command(after_help = "Examples:
   clearway ingest scans/*.bin poses.tum --sensor top
   clearway ingest drive.pcap --zenoh tcp/localhost:7447 --vehicle car --sensor top")]
-pub struct Options {
+pub struct IngestArguments {
     #[command(flatten)]
     files: FileOptions,
     #[command(flatten)]
     server: ServerOptions,
-    /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447; or, with --ca, --cert and --key,
+    /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447; or, with certificates,
     /// tls/HOST:7447.
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
@@ -55,13 +55,13 @@ pub struct Options {
 /// # Errors
 /// If a file cannot be read, if everything was refused, or as [`ClientError`](clearway_client::ClientError). A refused
 /// observation beside accepted ones is not an error; the output says so.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &IngestArguments) -> Result<()> {
     block_on(ingest(options))
 }
 
-async fn ingest(options: &Options) -> Result<()> {
-    let plan = Plan::new(&options.files)?;
-    let has_scans = plan.items.iter().any(|(_, item)| matches!(item, Item::Scan(_)));
+async fn ingest(options: &IngestArguments) -> Result<()> {
+    let plan = IngestPlan::new(&options.files)?;
+    let has_scans = plan.items.iter().any(|(_, item)| matches!(item, IngestItem::Scan(_)));
     if !options.sensor.is_empty() && !has_scans && plan.drives.is_empty() {
         return Err(usage_error("--sensor is for scans and drives, and the files have neither"));
     }
@@ -69,8 +69,13 @@ async fn ingest(options: &Options) -> Result<()> {
         Some(endpoint) => ingest_over_zenoh(endpoint, options).await?,
         None => options.server.connect().await?.ingest(&options.vehicle).await.map_err(explain)?,
     };
-    let mut sender =
-        Sender { ingester, paced: !options.fast, started: None, sent: BTreeMap::new(), refusals: Vec::new() };
+    let mut sender = ObservationSender {
+        ingester,
+        paced: !options.fast,
+        started: None,
+        sent: BTreeMap::new(),
+        refusals: Vec::new(),
+    };
     for (stamp_ns, item) in &plan.items {
         let (kind, observation) = item.read(&options.sensor, *stamp_ns)?;
         sender.send(kind, 1, *stamp_ns, observation).await?;
@@ -92,17 +97,17 @@ async fn ingest(options: &Options) -> Result<()> {
 }
 
 #[cfg(feature = "zenoh")]
-async fn ingest_over_zenoh(endpoint: &str, options: &Options) -> Result<Ingester> {
+async fn ingest_over_zenoh(endpoint: &str, options: &IngestArguments) -> Result<Ingester> {
     Ok(options.server.connect_over_zenoh(endpoint).await?.ingest(&options.vehicle).await?)
 }
 
 #[cfg(not(feature = "zenoh"))]
-async fn ingest_over_zenoh(endpoint: &str, _: &Options) -> Result<Ingester> {
+async fn ingest_over_zenoh(endpoint: &str, _: &IngestArguments) -> Result<Ingester> {
     bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
 }
 
 /// A stream of observations to a server, and the counts of what was sent and refused.
-struct Sender {
+struct ObservationSender {
     ingester: Ingester,
     /// True if each observation is sent at the time of its stamp.
     paced: bool,
@@ -113,7 +118,7 @@ struct Sender {
     refusals: Vec<Refusal>,
 }
 
-impl Sender {
+impl ObservationSender {
     async fn send(&mut self, kind: &'static str, count: u64, stamp_ns: i64, observation: Observation) -> Result<()> {
         let (started, first_ns) = *self.started.get_or_insert((Instant::now(), stamp_ns));
         if self.paced {
@@ -138,7 +143,7 @@ impl Sender {
     }
 }
 
-fn report(sender: &Sender, notes: &[String], as_json: bool) -> Result<()> {
+fn report(sender: &ObservationSender, notes: &[String], as_json: bool) -> Result<()> {
     let reasons = clearway_client::observation::by_reason(&sender.refusals);
     if as_json {
         print_line(&json!({ "sent": sender.sent, "refused": reasons, "notes": notes }).to_string())?;

@@ -14,6 +14,7 @@ use tracing_subscriber::layer::{Context, Layer};
 use tracing_subscriber::prelude::*;
 use tracing_subscriber::{EnvFilter, fmt};
 
+use crate::cli::shared::output::usage_error;
 use clearway_daemon::base::sync::locked;
 
 /// Most lines of one kind in a [`PERIOD`]. Ours: a start names each sensor and address once.
@@ -23,34 +24,34 @@ const PERIOD: Duration = Duration::from_secs(10);
 /// Most kinds that are remembered. Ours: the places that log, for some vehicles and sensors.
 const KINDS_MAX: usize = 4096;
 
-/// Format of the log.
-#[derive(Clone, Copy, clap::ValueEnum)]
-pub enum LogFormat {
-    /// Lines for people.
-    Text,
-    /// One JSON object a line.
-    Json,
-}
+/// Environment variable with the format of the log: `text` (the default) or `json`, one object a line.
+const FORMAT: &str = "CLEARWAY_LOG_FORMAT";
 
 /// Starts the log of this process. `RUST_LOG` selects what is logged.
-pub fn start(format: LogFormat) {
+///
+/// # Errors
+/// If the format is neither `text` nor `json`.
+pub fn start() -> anyhow::Result<()> {
+    let format = std::env::var(FORMAT).unwrap_or_default();
     let filter =
         EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error,object_store=warn"));
     let log = tracing_subscriber::registry().with(filter).with(Limit::default());
     let lines = fmt::layer().with_writer(std::io::stderr);
-    match format {
-        LogFormat::Text => log.with(lines.with_ansi(std::io::stderr().is_terminal())).init(),
-        LogFormat::Json => log.with(lines.json()).init(),
+    match &*format {
+        "" | "text" => log.with(lines.with_ansi(std::io::stderr().is_terminal())).init(),
+        "json" => log.with(lines.json()).init(),
+        other => return Err(usage_error(format!("{FORMAT}={other}: text and json are allowed"))),
     }
+    Ok(())
 }
 
 /// Leaves out lines that repeat themselves, and says so.
 #[derive(Default)]
-struct Limit(Mutex<Counts>);
+struct Limit(Mutex<LineCounts>);
 
 impl<S: Subscriber> Layer<S> for Limit {
     fn event_enabled(&self, event: &Event<'_>, _: Context<'_, S>) -> bool {
-        let mut about = About::default();
+        let mut about = LineSubject::default();
         event.record(&mut about);
         let kind = (event.metadata().callsite(), about.0.finish());
         let target = event.metadata().target();
@@ -74,9 +75,9 @@ impl<S: Subscriber> Layer<S> for Limit {
 
 /// What a line is about: its vehicle and its sensor, hashed.
 #[derive(Default)]
-struct About(DefaultHasher);
+struct LineSubject(DefaultHasher);
 
-impl Visit for About {
+impl Visit for LineSubject {
     fn record_debug(&mut self, field: &Field, value: &dyn std::fmt::Debug) {
         if matches!(field.name(), "vehicle" | "sensor") {
             (field.name(), format!("{value:?}")).hash(&mut self.0);
@@ -85,13 +86,13 @@ impl Visit for About {
 }
 
 /// Where a line comes from, and what it is about.
-type Kind = (Identifier, u64);
+type LineKind = (Identifier, u64);
 
 /// The lines of each kind in the newest period.
 #[derive(Default)]
-struct Counts(HashMap<Kind, Count>);
+struct LineCounts(HashMap<LineKind, LineCount>);
 
-struct Count {
+struct LineCount {
     since: Instant,
     lines: u32,
 }
@@ -107,15 +108,15 @@ enum Admission {
     LeftOut,
 }
 
-impl Counts {
-    fn admit(&mut self, kind: Kind, now: Instant) -> Admission {
+impl LineCounts {
+    fn admit(&mut self, kind: LineKind, now: Instant) -> Admission {
         if self.0.len() >= KINDS_MAX && !self.0.contains_key(&kind) {
             // What was left out of a kind that is still noisy stays counted.
             self.0.retain(|_, count| now.duration_since(count.since) < PERIOD || count.lines > LINES_MAX);
         }
-        let count = self.0.entry(kind).or_insert(Count { since: now, lines: 0 });
+        let count = self.0.entry(kind).or_insert(LineCount { since: now, lines: 0 });
         let left_out = match now.duration_since(count.since) >= PERIOD {
-            true => std::mem::replace(count, Count { since: now, lines: 0 }).lines.saturating_sub(LINES_MAX),
+            true => std::mem::replace(count, LineCount { since: now, lines: 0 }).lines.saturating_sub(LINES_MAX),
             false => 0,
         };
         count.lines = count.lines.saturating_add(1);
@@ -136,9 +137,9 @@ mod tests {
 
     /// A log that can be read.
     #[derive(Clone, Default)]
-    struct Lines(Arc<Mutex<Vec<u8>>>);
+    struct WrittenLines(Arc<Mutex<Vec<u8>>>);
 
-    impl Write for Lines {
+    impl Write for WrittenLines {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
             locked(&self.0).write(bytes)
         }
@@ -150,7 +151,7 @@ mod tests {
 
     #[test]
     fn a_line_that_repeats_itself_is_left_out_and_one_of_another_vehicle_is_not() {
-        let lines = Lines::default();
+        let lines = WrittenLines::default();
         let writer = lines.clone();
         let log = fmt::layer().with_ansi(false).with_writer(move || writer.clone());
         tracing::subscriber::with_default(tracing_subscriber::registry().with(Limit::default()).with(log), || {
@@ -165,7 +166,7 @@ mod tests {
 
     #[test]
     fn the_first_line_left_out_and_the_number_of_all_are_said() {
-        let (mut counts, start) = (Counts::default(), Instant::now());
+        let (mut counts, start) = (LineCounts::default(), Instant::now());
         let callsite = {
             use tracing::Callsite;
             tracing::callsite! { name: "test", kind: tracing::metadata::Kind::EVENT, fields: }.metadata().callsite()

@@ -48,7 +48,8 @@ const SENSOR: &str = "clearway simulate flat --sensor vlp16 --seconds 600 --to u
 ";
 
 /// The certificates of a reader.
-const TLS: &str = "--ca certificates/ca.pem --cert certificates/reader.pem --key certificates/reader.key";
+const TLS: &str = "env CLEARWAY_CA=certificates/ca.pem CLEARWAY_CERT=certificates/reader.pem \
+    CLEARWAY_KEY=certificates/reader.key";
 
 /// Runs a script in a network namespace and in this folder.
 fn follow(folder: &Path, script: &str) -> String {
@@ -120,15 +121,15 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
                 let ports =
                     ports.iter().chain(&["vehicle.udp.telemetry=127.0.0.1:0"]).map(|set| format!(" --set {set}"));
                 _ = writeln!(script, "{}{} 2>van.log &", block.trim(), ports.collect::<String>());
-                let listed = format!("bash -c 'clearway vehicles --json {TLS} | grep \\\"van\\\"'");
+                let listed = format!("bash -c '{TLS} clearway vehicles --json | grep \\\"van\\\"'");
                 _ = writeln!(script, "wait_until $! {listed}");
             }
             _ if block.starts_with("clearway serve") => {
-                _ = writeln!(script, "{} 2>serve.log &\nwait_until $! clearway vehicles {TLS}", block.trim());
+                _ = writeln!(script, "{} 2>serve.log &\nwait_until $! {TLS} clearway vehicles", block.trim());
                 // The vehicle listens nowhere that others could reach; the router does.
                 script += "ss --no-header --listening --tcp --udp --numeric --processes | grep \"pid=$pid,\" | tee listening\n";
                 script += "if grep -v ' 127.0.0.1:' listening; then exit 1; fi\n";
-                script += "if clearway vehicles --ca certificates/ca.pem; then exit 1; fi\n";
+                script += "if CLEARWAY_CA=certificates/ca.pem clearway vehicles; then exit 1; fi\n";
             }
             _ => script += block,
         }
