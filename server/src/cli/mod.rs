@@ -56,7 +56,7 @@ use shared::output::{printable, with_causes};
 
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]
-#[command(name = "clearway", version, after_help = after_help())]
+#[command(name = "clearway", version, after_help = after_help(), disable_help_subcommand = true)]
 struct ClearwayArguments {
     #[command(subcommand)]
     command: ClearwayCommand,
