@@ -58,7 +58,7 @@ pub struct ReplayArguments {
     #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     extrinsics: Option<Extrinsics>,
     /// Model of every sensor, if the data names the wrong one or none; of scans, the model whose elevations they have.
-    #[arg(long, value_parser = ModelParser::any())]
+    #[arg(long, value_parser = ModelParser)]
     model: Option<Model>,
     /// A ROS topic of a ROS 2 bag (MCAP) to read; may be given several times. Sensors and poses are chosen if absent.
     #[arg(long = "topic", value_name = "TOPIC")]

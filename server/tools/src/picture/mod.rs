@@ -10,9 +10,7 @@
 //! |---|---|
 //! | [`image`] | pixels -> a PNG; text, rectangles and pictures in a picture |
 //! | `legend` | a map, lines -> the picture with the lines and a scale bar under it |
-//! | [`change`] | two maps -> pictures of them and of what changed |
 
-pub mod change;
 pub mod image;
 mod legend;
 
