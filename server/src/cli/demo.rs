@@ -33,9 +33,6 @@ pub struct DemoArguments {
     /// Listen on ports that the operating system chooses. Without it a port that is in use is replaced by such a one.
     #[arg(long)]
     any_port: bool,
-    /// Print one JSON object a second, and a summary.
-    #[arg(long)]
-    json: bool,
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {
@@ -52,23 +49,19 @@ pub fn run(arguments: DemoArguments) -> Result<()> {
 }
 
 async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
-    let DemoArguments { seconds: duration, record, sensors, any_port, json } = arguments;
+    let DemoArguments { seconds: duration, record, sensors, any_port } = arguments;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let picture = record.as_ref().map_or_else(|| folder.join("demo.png"), |record| record.with_extension("png"));
     let options = DemoOptions { duration, record: record.clone(), picture: Some(picture.clone()), sensors, any_port };
     let begun = |endpoints: &DemoEndpoints| {
-        if !json {
-            let _ = print_line(&introduction(endpoints, record.as_deref(), &picture));
-        }
+        let _ = print_line(&introduction(endpoints, record.as_deref(), &picture));
     };
     let report = |report: &DemoReport| {
-        let _ = print_line(&if json { report.to_json().to_string() } else { report.line() });
+        let _ = print_line(&report.line());
     };
     let summary = demo(options, begun, report, stop_signal()?).await?;
-    print_line(&if json { summary.to_json().to_string() } else { summary.text() })?;
-    if !json {
-        print_line(&left_behind(record.as_deref(), &picture))?;
-    }
+    print_line(&summary.text())?;
+    print_line(&left_behind(record.as_deref(), &picture))?;
     Ok(())
 }
 

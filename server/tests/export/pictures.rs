@@ -85,7 +85,7 @@ fn a_picture_has_links_and_radii_of_safe_points_over_the_classes() {
         assert_eq!(with_paths.at(x_m, y_m), line, "{x_m} m ahead, {y_m} m to the left");
     }
     // Only the last point is an end; its radius is 2.5 m.
-    for (x_m, y_m, is_drawn) in [(6.1, 14.5, true), (6.1, 9.5, true), (8.5, 12.1, true), (6.1, 13.6, false)] {
+    for (x_m, y_m, is_drawn) in [(6.1, 14.5, true), (6.1, 9.6, true), (8.5, 12.1, true), (6.1, 13.6, false)] {
         let differs = with_paths.at(x_m, y_m) != plain.at(x_m, y_m);
         assert_eq!(differs, is_drawn, "{x_m} m ahead, {y_m} m to the left");
     }

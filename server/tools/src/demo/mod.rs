@@ -7,7 +7,7 @@
 //! | [`sensors`] | the choice of sensors, this machine -> the model on the roof |
 //! | [`rig`] | scene, sensors -> the vehicle's configuration, datagrams, observations |
 //! | [`car`] | rig, clock -> UDP and gRPC in real time |
-//! | [`report`] | status -> a line, or JSON |
+//! | [`report`] | status -> a line |
 
 pub mod car;
 pub mod report;

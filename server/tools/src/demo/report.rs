@@ -1,11 +1,10 @@
 //! The state of a running demo, once a second and at its end.
 //!
-//! In: the vehicle's status, the car's skipped time. Out: a line for people, or JSON.
+//! In: the vehicle's status, the car's skipped time. Out: a line for people.
 
 use std::time::Duration;
 
 use clearway_sim::send::Sent;
-use serde_json::{Value, json};
 
 use clearway_daemon::status::Snapshot;
 use clearway_journal::counted::counted;
@@ -85,25 +84,6 @@ impl DemoReport {
         }
         line
     }
-
-    /// The report as a JSON object.
-    pub fn to_json(&self) -> Value {
-        let snapshot = &self.snapshot;
-        json!({
-            "seconds": self.elapsed.as_secs_f64(),
-            "revolutions": snapshot.revolutions(),
-            "maps": snapshot.maps,
-            "packets": snapshot.packets_json(),
-            "telemetry": snapshot.ledger.telemetry,
-            "lost": snapshot.ledger.lost,
-            "kernel_drops": snapshot.ledger.kernel_drops,
-            "age_ms": self.age_ms,
-            "stale": self.is_stale(),
-            "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
-            "drivable_share": snapshot.drivable_share,
-            "simulation_skipped_s": self.skipped.as_secs_f64(),
-        })
-    }
 }
 
 impl DemoSummary {
@@ -122,13 +102,6 @@ impl DemoSummary {
             text += &format!("\nThe simulation skipped {skipped:.1} s of {all:.1} s: this machine was too slow.");
         }
         text
-    }
-
-    /// The summary as a JSON object.
-    pub fn to_json(&self) -> Value {
-        let mut object = self.last.to_json();
-        object["sent"] = json!({ "packets": self.sent.packets, "telemetry": self.sent.telemetry });
-        object
     }
 }
 
@@ -154,6 +127,6 @@ mod tests {
         assert!(first.line().ends_with(text), "{}", first.line());
         let second = first.next(Duration::from_secs(2), Snapshot::default(), None, first.skipped);
         assert!(!second.line().contains("skipped"), "{}", second.line());
-        assert_eq!(second.to_json()["simulation_skipped_s"], 0.4);
+        assert_eq!(second.skipped, first.skipped);
     }
 }

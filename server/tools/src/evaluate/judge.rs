@@ -74,11 +74,11 @@ pub struct JudgedPoint {
 /// Adds the counts of `layer` against the points of its frame. Returns `false` and adds nothing if none of its classes
 /// is free.
 pub fn judge(tally: &mut Tally, layer: &Layer, points: &[JudgedPoint]) -> bool {
-    let Some(called) = called(layer) else { return false };
+    let Some(called) = meanings(layer) else { return false };
     let cell_of = locate(&layer.geometry);
     let cells: Vec<Option<usize>> = points.iter().map(|point| cell_of(point.place)).collect();
     let mut classes = Classes::default();
-    let mut ballots = vec![Ballot::default(); called.len()];
+    let mut ballots = vec![Ballot { lowest: f32::INFINITY, ..Ballot::default() }; called.len()];
     for (point, cell) in points.iter().zip(&cells).filter_map(|(point, cell)| Some((point, (*cell)?))) {
         ballots[cell].cast(point, classes.bit(point.class));
     }
@@ -88,7 +88,7 @@ pub fn judge(tally: &mut Tally, layer: &Layer, points: &[JudgedPoint]) -> bool {
     }
     for (point, cell) in points.iter().zip(&cells).filter_map(|(point, cell)| Some((point, (*cell)?))) {
         let near_ground = point.place[2] - ballots[cell].lowest <= GROUND_OVER_LOWEST_M;
-        score(tally, point, called[cell].is_free() && near_ground);
+        score(tally, point, is_free(called[cell]) && near_ground);
     }
     true
 }
@@ -111,8 +111,8 @@ fn score(tally: &mut Tally, point: &JudgedPoint, called_ground: bool) {
     }
 }
 
-fn add_cell(tally: &mut Tally, ballot: &Ballot, called: Called, classes: &Classes) {
-    let (verdict, free) = (ballot.verdict(), called.is_free());
+fn add_cell(tally: &mut Tally, ballot: &Ballot, called: Meaning, classes: &Classes) {
+    let (verdict, free) = (ballot.verdict(), is_free(called));
     let wrong = matches!(verdict, Some(Vote::Obstacle | Vote::Forbidden));
     tally.called += u64::from(free && ballot.seen);
     tally.called_wrongly += u64::from(free && wrong);
@@ -123,7 +123,7 @@ fn add_cell(tally: &mut Tally, ballot: &Ballot, called: Called, classes: &Classe
     }
     if verdict == Some(Vote::Drivable) {
         tally.drivable.add(free);
-        tally.not_reached.add(called == Called::NotReached);
+        tally.not_reached.add(called == Meaning::NotReached);
         if let Some(band) = band {
             tally.by_range[band].add(free);
             for class in classes.of(ballot.ground) {
@@ -135,9 +135,9 @@ fn add_cell(tally: &mut Tally, ballot: &Ballot, called: Called, classes: &Classe
         tally.road.add(free);
     }
     if ballot.scored_ground && verdict != Some(Vote::Obstacle) && !ballot.steep {
-        tally.ground.add(called == Called::Occupied);
+        tally.ground.add(called == Meaning::Occupied);
         if !ballot.mixed {
-            tally.pure_ground.add(called == Called::Occupied);
+            tally.pure_ground.add(called == Meaning::Occupied);
         }
     }
     if free {
@@ -174,7 +174,7 @@ impl Classes {
 }
 
 /// The votes of the points in one cell.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Ballot {
     /// Number of points.
     points: u32,
@@ -195,25 +195,6 @@ struct Ballot {
     votes: [u32; 3],
     /// z of the lowest point, in metres.
     lowest: f32,
-}
-
-impl Default for Ballot {
-    fn default() -> Self {
-        Self {
-            points: 0,
-            range_m: 0.0,
-            seen: false,
-            road: false,
-            steep: false,
-            scored_ground: false,
-            mixed: false,
-            obstacles: 0,
-            forbidden: 0,
-            ground: 0,
-            votes: [0; 3],
-            lowest: f32::INFINITY,
-        }
-    }
 }
 
 impl Ballot {
@@ -258,43 +239,25 @@ impl Ballot {
     }
 }
 
-/// What a layer says about a cell.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Called {
-    /// Free, or inferred to be free.
-    Free,
-    /// Something stands in the cell.
-    Occupied,
-    /// Free ground to which the layer found no way.
-    NotReached,
-    /// Unknown or hidden.
-    Unknown,
-}
-
-impl Called {
-    fn is_free(self) -> bool {
-        self == Self::Free
-    }
+/// True if a map calls a cell of this meaning drivable.
+fn is_free(meaning: Meaning) -> bool {
+    matches!(meaning, Meaning::Free | Meaning::Inferred)
 }
 
 /// What the layer says about each cell; `None` if it has no free class.
-fn called(layer: &Layer) -> Option<Vec<Called>> {
-    let meanings = layer.legend.iter().map(|class| match class.meaning {
-        Meaning::Free | Meaning::Inferred => Called::Free,
-        Meaning::Occupied => Called::Occupied,
-        Meaning::NotReached => Called::NotReached,
-        Meaning::Unknown | Meaning::Hidden => Called::Unknown,
-    });
-    let meanings: Vec<Called> = meanings.collect();
+fn meanings(layer: &Layer) -> Option<Vec<Meaning>> {
     let class = layer.channels.iter().find(|channel| channel.name == "class")?;
-    if !meanings.contains(&Called::Free) {
+    if !layer.legend.iter().any(|class| is_free(class.meaning)) {
         return None;
     }
-    let meaning = |class: usize| meanings.get(class).copied().unwrap_or(Called::Unknown);
+    let meaning = |class: i32| {
+        let class = usize::try_from(class).ok().and_then(|class| layer.legend.get(class));
+        class.map_or(Meaning::Unknown, |class| class.meaning)
+    };
     Some(match &class.cells {
-        Cells::U8(cells) => cells.iter().map(|cell| meaning(usize::from(*cell))).collect(),
-        Cells::U16(cells) => cells.iter().map(|cell| meaning(usize::from(*cell))).collect(),
-        Cells::I8(cells) => cells.iter().map(|cell| usize::try_from(*cell).map_or(Called::Unknown, meaning)).collect(),
+        Cells::U8(cells) => cells.iter().map(|cell| meaning((*cell).into())).collect(),
+        Cells::U16(cells) => cells.iter().map(|cell| meaning((*cell).into())).collect(),
+        Cells::I8(cells) => cells.iter().map(|cell| meaning((*cell).into())).collect(),
     })
 }
 

@@ -1,6 +1,5 @@
 //! The result of an evaluation, and the result as JSON. `table.rs` writes it as text.
 
-use clearway_mapping::layer::Layer;
 use clearway_mapping::pipeline::Pipeline;
 use serde_json::{Value, json};
 
@@ -46,19 +45,8 @@ pub struct EvaluatedRow {
 impl EvaluatedRow {
     /// Adds the counts of a pipeline's newest map, and of its estimate of the ground, against the points of its frame.
     pub fn judge_map(&mut self, pipeline: &Pipeline, points: &[JudgedPoint]) {
-        if let Some(map) = pipeline.newest_map() {
-            self.judge(&map.layers, points);
-        }
-        if let Some(ground) = pipeline.newest_ground() {
-            let height_over_m = |[x, y, z]: [f32; 3]| Some(ground.height_over_m(x, y, z)).filter(|over| !over.is_nan());
-            self.judge_ground(points, height_over_m);
-        }
-    }
-
-    /// Adds the counts of all layers of a map against the points of its frame.
-    fn judge(&mut self, layers: &[Layer], points: &[JudgedPoint]) {
-        self.frames += 1;
-        for layer in layers {
+        self.frames += u64::from(pipeline.newest_map().is_some());
+        for layer in pipeline.newest_map().iter().flat_map(|map| &map.layers) {
             let mut tally = Tally::default();
             if judge(&mut tally, layer, points) {
                 self.tally(layer.name).merge(&tally);
@@ -66,12 +54,10 @@ impl EvaluatedRow {
                 self.left_out.push(layer.name.to_owned());
             }
         }
-    }
-
-    /// Adds the counts of an estimate of the ground, under the name `ground`. `height_over_m` is the height of a
-    /// position of the ego frame over it, in metres; `None` if the estimate does not cover it.
-    fn judge_ground(&mut self, points: &[JudgedPoint], height_over_m: impl Fn([f32; 3]) -> Option<f32>) {
-        judge_ground(self.tally("ground"), points, height_over_m);
+        if let Some(ground) = pipeline.newest_ground() {
+            let height_over_m = |[x, y, z]: [f32; 3]| Some(ground.height_over_m(x, y, z)).filter(|over| !over.is_nan());
+            judge_ground(self.tally("ground"), points, height_over_m);
+        }
     }
 
     /// Adds the counts of another row.
