@@ -9,7 +9,8 @@ use clearway_tools::export::{ExportFormat, ExportOptions, Exported, export};
 use super::picture_options::PictureOptions;
 use super::shared::exit::Exit;
 use super::shared::files;
-use super::shared::output::{counted, print_line, progress_bar, usage_error};
+use super::shared::output::{counted, print_line, usage_error};
+use super::tool_commands::progress_bar;
 
 /// Export the maps of a recording: files for each map, or one MCAP file for viewers.
 ///

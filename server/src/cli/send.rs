@@ -11,7 +11,8 @@ use serde_json::json;
 
 use super::shared::exit::Exit;
 use super::shared::files;
-use super::shared::output::{counted, print_line, progress_bar};
+use super::shared::output::{counted, print_line};
+use super::tool_commands::progress_bar;
 
 /// Send the datagrams of a capture over UDP, at the recorded pace.
 ///

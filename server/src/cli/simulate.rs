@@ -12,7 +12,8 @@ use clearway_tools::simulate::SimulatedDrive;
 
 use super::send::target;
 use super::shared::model::ModelParser;
-use super::shared::output::{counted, print_line, progress_bar};
+use super::shared::output::{counted, print_line};
+use super::tool_commands::progress_bar;
 
 /// The names of the scenes as the command line accepts them.
 fn names() -> PossibleValuesParser {

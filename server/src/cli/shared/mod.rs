@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `configuration` | options -> a configuration, extrinsics |
 //! | `model` | the name of a sensor model -> the model |
-//! | `output` | text -> stdout; progress bar, runtime, signals, errors of usage |
+//! | `output` | text -> stdout; runtime, signals, errors of usage |
 //! | `logs` | events of the log -> lines on stderr |
 //! | `exit` | the exit codes |
 

@@ -1,4 +1,4 @@
-//! What the subcommands share to run and to print: stdout, the progress bar, the runtime, the signals that end them.
+//! What the subcommands share to run and to print: stdout, the progress of a replay, the runtime, the signals.
 
 use std::io::{ErrorKind, Write};
 use std::sync::Arc;
@@ -55,12 +55,6 @@ pub fn print_line(line: &str) -> Result<bool> {
 /// An error of usage that only the values of several options together show; the command ends with exit code 3.
 pub fn usage_error(message: impl std::fmt::Display) -> Error {
     clap::Error::raw(clap::error::ErrorKind::ArgumentConflict, format!("{message}\n")).into()
-}
-
-/// A progress bar on stderr of `length` bytes; nothing is drawn if stderr is not a terminal.
-pub fn progress_bar(length: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg}").expect("the template is a constant");
-    ProgressBar::new(length).with_style(style)
 }
 
 /// A progress bar of the bytes of a replay, which is cleared when this is dropped.
