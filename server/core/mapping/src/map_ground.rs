@@ -5,6 +5,7 @@
 
 use nalgebra::{Isometry3, Point3};
 
+use crate::fusion::MergedScans;
 use crate::ground::Ground;
 use crate::ground::config::Variant;
 use crate::layer::registry::MapsConfig;
@@ -51,10 +52,10 @@ impl MapGround {
     }
 
     /// Estimates the ground of a map from its points and the remembered ones, and what the vehicle can reach on it.
-    /// `scan` is the scan of sensor `source` that made the map.
-    pub fn estimate(&mut self, sweep: &Sweep, source: u16, scan: &SensorScan) {
-        let is_sole = std::ptr::eq(sweep, &scan.sweep);
-        self.sole_scan = is_sole.then_some((source, scan.completed));
+    /// `scan` is the newest scan of the map's source.
+    pub fn estimate(&mut self, merged: &MergedScans, scan: &SensorScan) {
+        let sweep = &*merged.sweep;
+        self.sole_scan = merged.sole_scan.map(|number| (merged.source as u16, number));
         if let Some(Estimates { ground, reach, memory, map_from_ground }) = &mut self.estimates {
             match memory {
                 None => ground.estimate(sweep),

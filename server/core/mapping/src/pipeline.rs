@@ -42,6 +42,10 @@ pub struct Pipeline {
     maps_made: u64,
     /// The newest map, whose memory the next one uses.
     map: Map,
+    /// The scans of the newest map; `None` before the first.
+    merged: Option<MergedScans>,
+    /// Number of scans that were completed after the newest map was made.
+    scans_since_map: u64,
 }
 
 /// A sensor with its status and its counts.
@@ -121,6 +125,8 @@ impl Pipeline {
             layers,
             maps_made: 0,
             map: Map::default(),
+            merged: None,
+            scans_since_map: 0,
         })
     }
 
@@ -143,6 +149,7 @@ impl Pipeline {
         let outcome = self.inputs.apply(event, now);
         self.ledgers.record(event, &outcome);
         let completed = outcome?.completed_scan.map(|_| event.source);
+        self.scans_since_map += u64::from(completed.is_some());
         self.choose_reference(completed, now);
         let merged = self.merge_scans(event, completed, now);
         self.estimate_ground(merged.as_ref());
@@ -157,7 +164,7 @@ impl Pipeline {
     fn remove_sensor(&mut self, source: u16) {
         let index = usize::from(source);
         let was_reference = self.fusion.reference_sensor() == index;
-        self.fusion.remove_sensor(index, self.inputs.scans());
+        self.fusion.remove_sensor(index);
         self.inputs.remove_sensor(source);
         self.ledgers.remove_sensor(source, self.inputs.sources());
         self.ground.forget_scan();
@@ -182,14 +189,13 @@ impl Pipeline {
     /// evidence have seen one scan. `None` if no layer is active, if the newest map has layers, or if a sensor has
     /// completed a scan since.
     pub fn remake_newest_map(&mut self) -> Option<&Map> {
-        let is_empty = self.maps_made > 0 && self.map.layers.is_empty();
-        if !is_empty || !self.layers.any_active() || !self.fusion.is_current() {
+        let merged = self.merged.as_ref().filter(|_| self.map.layers.is_empty() && self.layers.any_active())?;
+        let scan = &self.inputs.scans()[self.fusion.source()?];
+        if self.scans_since_map > 0 || self.fusion.is_waiting() || scan.end_ns != merged.end_ns {
             return None;
         }
-        let (source, scans) = (self.map.source, self.inputs.scans());
-        let scan = &scans[usize::from(source)];
-        self.ground.estimate(self.fusion.sweep(scans), source, scan);
-        self.layers.integrate(&self.ground.rays(scan, source));
+        self.ground.estimate(merged, scan);
+        self.layers.integrate(&self.ground.rays(scan, self.map.source));
         self.make_layers();
         Some(&self.map)
     }
@@ -248,7 +254,8 @@ impl Pipeline {
 
     /// Points from which the newest map was made, ego frame at its stamp; empty before the first scan.
     pub fn newest_sweep(&self) -> &Sweep {
-        self.fusion.sweep(self.inputs.scans())
+        let of_reference = || &*self.inputs.scans()[self.fusion.reference_sensor()].sweep;
+        self.merged.as_ref().map_or_else(of_reference, |merged| &merged.sweep)
     }
 
     /// Local ground of the newest map; `None` before the first, and if heights are taken over the plane under the
@@ -294,8 +301,7 @@ impl Pipeline {
     fn estimate_ground(&mut self, merged: Option<&MergedScans>) {
         let scans = self.inputs.scans();
         if let Some(merged) = merged.filter(|_| self.layers.uses().ground) {
-            let source = merged.source;
-            self.ground.estimate(self.fusion.sweep(scans), source as u16, &scans[source]);
+            self.ground.estimate(merged, &scans[merged.source]);
         }
     }
 
@@ -313,7 +319,7 @@ impl Pipeline {
     }
 
     /// Begins the next map in place of the newest one: all but its sequence and its layers.
-    fn begin_map(&mut self, merged: MergedScans, now: EventTime) {
+    fn begin_map(&mut self, mut merged: MergedScans, now: EventTime) {
         let map = &mut self.map;
         let goes_back = self.maps_made > 0 && merged.end_ns <= map.capture_end_ns;
         map.epoch = map.epoch.saturating_add(u32::from(goes_back && self.has_epochs));
@@ -322,14 +328,19 @@ impl Pipeline {
         (map.map_from_ego, map.speed_mps) = (merged.map_from_ego, merged.speed_mps);
         (map.compensation, map.source) = (merged.compensation, merged.source as u16);
         map.reference_sensor = self.fusion.reference_sensor() as u16;
-        map.sensors = merged.sensors;
+        map.sensors = std::mem::take(&mut merged.sensors);
         for (sensor, ledger) in map.sensors.iter_mut().zip(self.ledgers.sensors()) {
             sensor.refused = ledger.refused_sum();
         }
+        if let Some(former) = self.merged.replace(merged) {
+            self.fusion.reuse(former);
+        }
+        self.scans_since_map = 0;
     }
 
     /// Makes the active layers of the map that has begun, and numbers it.
     fn make_layers(&mut self) {
+        let Some(merged) = &self.merged else { return };
         let (stamp_ns, roads) = (self.map.capture_end_ns, self.inputs.roads());
         let context = Context {
             earlier: &[],
@@ -343,8 +354,7 @@ impl Pipeline {
             road: roads.to_paint(),
             route: roads.route(),
         };
-        let sweep = self.fusion.sweep(self.inputs.scans());
-        let sweep = if context.ground.is_some() { self.ground.sweep(sweep) } else { sweep };
+        let sweep = if context.ground.is_some() { self.ground.sweep(&merged.sweep) } else { &*merged.sweep };
         self.layers.make(sweep, &context, &mut self.map.layers);
         self.map.sequence = self.maps_made;
         self.maps_made += 1;

@@ -23,6 +23,8 @@
 pub(crate) mod config;
 pub(crate) mod reference_sensor;
 
+use std::sync::Arc;
+
 use nalgebra::Isometry3;
 
 use crate::event_time::EventTime;
@@ -56,38 +58,12 @@ struct NewestMap {
 /// A map whose source has completed its scan, while scans with the same stamp are due.
 #[derive(Clone)]
 struct WaitingMap {
-    /// The source's scan, without its points.
-    own: OwnScan,
+    /// What the map has of its source's scan alone. A later scan does not change it.
+    own: MergedScans,
     /// Indices of the sensors whose scans are due.
     due: Vec<usize>,
     /// Event time from which the map waits, ns.
     since_ns: i64,
-}
-
-/// What a map needs of its source's scan beside the points. A later scan does not change it.
-#[derive(Clone)]
-struct OwnScan {
-    source: usize,
-    start_ns: i64,
-    end_ns: i64,
-    compensation: Compensation,
-    map_from_ego: Option<Isometry3<f64>>,
-    speed_mps: Option<f64>,
-    state: SensorState,
-}
-
-impl OwnScan {
-    fn new(source: usize, scan: &SensorScan) -> Self {
-        Self {
-            source,
-            start_ns: scan.start_ns,
-            end_ns: scan.end_ns,
-            compensation: scan.compensation,
-            map_from_ego: scan.map_from_ego,
-            speed_mps: scan.speed_mps,
-            state: scan.state.clone(),
-        }
-    }
 }
 
 /// The fusion of one vehicle.
@@ -98,16 +74,12 @@ pub(crate) struct Fusion {
     period_ns: i64,
     newest: Option<NewestMap>,
     waiting: Option<WaitingMap>,
-    /// Points of the scan of the map that waits.
-    waiting_sweep: Sweep,
-    /// True if the newest scan of any sensor made the newest map.
-    is_current: bool,
-    /// The newest map's points if they are not the points of its source alone.
-    sweep: Sweep,
-    is_merged: bool,
+    /// Memory for the points of the next map that needs its own.
+    spare: Sweep,
 }
 
-/// What a map states about the scans in it.
+/// The scans of one map: its points, and what the map states about them.
+#[derive(Clone)]
 pub(crate) struct MergedScans {
     /// Index of the sensor whose scan made the map.
     pub source: usize,
@@ -123,6 +95,27 @@ pub(crate) struct MergedScans {
     pub compensation: Compensation,
     /// State of every sensor, by source; `refused` is 0.
     pub sensors: Vec<SensorState>,
+    /// Points, ego frame at `end_ns`.
+    pub sweep: Arc<Sweep>,
+    /// Number of the source's scan if its points alone are those of the map; `None` for a map of several scans.
+    pub sole_scan: Option<u64>,
+}
+
+impl MergedScans {
+    /// The source's scan alone.
+    fn of_source(source: usize, scan: &SensorScan) -> Self {
+        Self {
+            source,
+            start_ns: scan.start_ns,
+            end_ns: scan.end_ns,
+            map_from_ego: scan.map_from_ego,
+            speed_mps: scan.speed_mps,
+            compensation: scan.compensation,
+            sensors: vec![SensorState { age_ms: Some(0.0), ..scan.state.clone() }],
+            sweep: Arc::clone(&scan.sweep),
+            sole_scan: Some(scan.completed),
+        }
+    }
 }
 
 impl Fusion {
@@ -134,10 +127,7 @@ impl Fusion {
             period_ns: i64::from(config.period_ms) * NS_PER_MS,
             newest: None,
             waiting: None,
-            waiting_sweep: Sweep::default(),
-            is_current: false,
-            sweep: Sweep::default(),
-            is_merged: false,
+            spare: Sweep::default(),
         }
     }
 
@@ -156,31 +146,27 @@ impl Fusion {
         self.newest?.source
     }
 
-    /// Forgets a sensor that is withdrawn. The points of the newest map stay; a map of its last scan that still waits
-    /// for scans of others is not made.
-    pub fn remove_sensor(&mut self, source: usize, scans: &[SensorScan]) {
-        if self.source() == Some(source) {
-            self.copy_once(&scans[source].sweep);
-            self.newest.iter_mut().for_each(|newest| newest.source = None);
-            self.is_current = false;
-        }
+    /// Forgets a sensor that is withdrawn. A map of its last scan that still waits for scans of others is not made.
+    pub fn remove_sensor(&mut self, source: usize) {
+        self.newest.iter_mut().filter(|newest| newest.source == Some(source)).for_each(|newest| newest.source = None);
         self.waiting.take_if(|waiting| waiting.own.source == source);
         self.waiting.iter_mut().for_each(|waiting| waiting.due.retain(|due| *due != source));
     }
 
-    /// True if no sensor has completed a scan since the newest map was made.
-    pub fn is_current(&self) -> bool {
-        self.is_current
+    /// True if a map waits for scans with the same stamp.
+    pub fn is_waiting(&self) -> bool {
+        self.waiting.is_some()
     }
 
-    /// Points of the newest map; before the first map those of the reference sensor's newest scan.
-    pub fn sweep<'a>(&'a self, scans: &'a [SensorScan]) -> &'a Sweep {
-        let source = self.source().unwrap_or(self.reference_sensor);
-        if self.is_merged { &self.sweep } else { &scans[source].sweep }
+    /// Takes back the memory of a map that is read no more.
+    pub fn reuse(&mut self, map: MergedScans) {
+        if let Some(sweep) = Arc::into_inner(map.sweep) {
+            self.spare = sweep;
+        }
     }
 
-    /// Merges the newest scans to the points of a map if the scan that sensor `source` has just completed makes one, or
-    /// if it is the last for which a map waits; `None` if there is no map. [`Fusion::sweep`] then returns the points.
+    /// Merges the newest scans if the scan that sensor `source` has just completed makes a map, or if it is the last
+    /// for which a map waits; `None` if there is no map.
     pub fn merge(
         &mut self,
         source: usize,
@@ -189,7 +175,6 @@ impl Fusion {
         now: EventTime,
     ) -> Option<MergedScans> {
         let makes_map = self.makes_map(source, scans, now);
-        self.is_current = false;
         if let Some(waiting) = &mut self.waiting {
             waiting.due.retain(|due| *due != source);
         }
@@ -197,17 +182,14 @@ impl Fusion {
         if !makes_map {
             return released;
         }
-        let own = OwnScan::new(source, &scans[source]);
+        let own = MergedScans::of_source(source, &scans[source]);
         self.newest = Some(NewestMap { source: Some(source), stamp_ns: own.end_ns, event_ns: now.event_ns });
         let due = self.due(source, scans, now);
         if released.is_some() || !due.is_empty() {
             // Only one map is made at a time: behind a map that has waited, this one waits for the next event.
-            self.is_current = false;
             self.waiting = Some(WaitingMap { own, due, since_ns: now.event_ns });
-            self.waiting_sweep.copy_from(&scans[source].sweep);
             return released;
         }
-        (self.is_merged, self.is_current) = (false, true);
         Some(self.merge_scans(own, scans, motion, now))
     }
 
@@ -233,9 +215,6 @@ impl Fusion {
             is_over || waiting.due.is_empty() || now.event_ns.saturating_sub(waiting.since_ns) > wait_ns
         };
         let waiting = self.waiting.take_if(is_over)?;
-        std::mem::swap(&mut self.sweep, &mut self.waiting_sweep);
-        self.is_merged = true;
-        self.is_current = scans[waiting.own.source].end_ns == waiting.own.end_ns;
         Some(self.merge_scans(waiting.own, scans, motion, now))
     }
 
@@ -325,27 +304,19 @@ impl Fusion {
         since_ns.saturating_abs() > self.deadline_ns
     }
 
-    fn merge_scans(&mut self, mut own: OwnScan, scans: &[SensorScan], motion: &Motion, now: EventTime) -> MergedScans {
-        let (source, stamp_ns) = (own.source, own.end_ns);
-        let mut merged = MergedScans {
-            source,
-            start_ns: own.start_ns,
-            end_ns: stamp_ns,
-            map_from_ego: own.map_from_ego,
-            speed_mps: own.speed_mps,
-            compensation: own.compensation,
-            sensors: Vec::with_capacity(scans.len()),
-        };
+    /// Adds the scans of all other sensors to the scan of the source.
+    fn merge_scans(&mut self, own: MergedScans, scans: &[SensorScan], motion: &Motion, now: EventTime) -> MergedScans {
+        let (source, stamp_ns, mut merged) = (own.source, own.end_ns, own);
+        let mut own_state = merged.sensors.pop();
         for (index, scan) in scans.iter().enumerate() {
             if index == source {
-                merged.sensors.push(SensorState { age_ms: Some(0.0), ..std::mem::take(&mut own.state) });
+                merged.sensors.extend(own_state.take());
                 continue;
             }
             let contribution = self.contribution(scan, stamp_ns, now);
             if contribution.is_in_map() {
                 let (stamp_from_end, compensation) = motion.propagate(scan.end_ns, stamp_ns);
-                self.copy_once(&scans[source].sweep);
-                self.sweep.append(&scan.sweep, &stamp_from_end);
+                self.points_mut(&mut merged).append(&scan.sweep, &stamp_from_end);
                 merged.start_ns = merged.start_ns.min(scan.start_ns);
                 merged.compensation = merged.compensation.min(compensation).min(scan.compensation);
             }
@@ -353,18 +324,19 @@ impl Fusion {
         }
         let reference = &scans[self.reference_sensor].sweep;
         if source != self.reference_sensor && reference.calibration.is_some() {
-            self.copy_once(&scans[source].sweep);
-            self.sweep.copy_rows(reference);
+            self.points_mut(&mut merged).copy_rows(reference);
         }
         merged
     }
 
-    /// Begins the map's own sweep with a copy of its source's sweep, unless it has begun.
-    fn copy_once(&mut self, source: &Sweep) {
-        if !self.is_merged {
-            self.sweep.copy_from(source);
-            self.is_merged = true;
+    /// The map's own points, which begin as a copy of its source's.
+    fn points_mut<'a>(&mut self, merged: &'a mut MergedScans) -> &'a mut Sweep {
+        if merged.sole_scan.take().is_some() {
+            let mut points = std::mem::take(&mut self.spare);
+            points.copy_from(&merged.sweep);
+            merged.sweep = Arc::new(points);
         }
+        Arc::make_mut(&mut merged.sweep)
     }
 
     /// What the newest scan of a sensor that is not the source contributes to a map.

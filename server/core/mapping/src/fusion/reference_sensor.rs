@@ -129,8 +129,9 @@ mod tests {
         let mut scan = SensorScan::new("top", [1.0, 2.0, 1.8], tilt_deg.to_radians());
         for sector in 0..sectors {
             let angle = (sector as f32 + 0.5) * std::f32::consts::TAU / SECTORS as f32;
-            scan.sweep.x.push(1.0 + 9.0 * libm::cosf(angle));
-            scan.sweep.y.push(2.0 + 9.0 * libm::sinf(angle));
+            let sweep = std::sync::Arc::make_mut(&mut scan.sweep);
+            sweep.x.push(1.0 + 9.0 * libm::cosf(angle));
+            sweep.y.push(2.0 + 9.0 * libm::sinf(angle));
         }
         scan
     }

@@ -212,10 +212,11 @@ impl SensorPipeline {
         let revolution = self.decoder.newest()?;
         let (mount, filter) = (&self.mount, self.filter.as_ref());
         motion.follow_revolution(revolution, &mut self.trajectory);
-        let removed = scan.sweep.set_moving_revolution(revolution, mount, &self.trajectory.end_from_ego, filter);
+        let sweep = scan.next_sweep();
+        let removed = sweep.set_moving_revolution(revolution, mount, &self.trajectory.end_from_ego, filter);
         if let Some(series) = &mut self.series {
             let noise_m = self.range_noise_m.unwrap_or(revolution.model.spec().range_noise_m);
-            scan.sweep.set_deviations(revolution, mount, &mut series.of_lasers, noise_m, filter);
+            sweep.set_deviations(revolution, mount, &mut series.of_lasers, noise_m, filter);
         }
         if self.finds_no_returns {
             find_no_returns(revolution, mount, &self.trajectory, filter, &mut scan.no_returns);
@@ -262,12 +263,13 @@ impl SensorPipeline {
         self.find_elevations(scan);
         motion.follow_scan(scan, &mut self.trajectory);
         let (calibration, end_from_ego) = (self.scan_calibration.as_ref(), &self.trajectory.end_from_ego);
-        let removed = newest.sweep.set_moving_scan(scan, calibration, &self.mount, end_from_ego, self.filter.as_ref());
+        let sweep = newest.next_sweep();
+        let removed = sweep.set_moving_scan(scan, calibration, &self.mount, end_from_ego, self.filter.as_ref());
         if let Some(series) = &mut self.series {
             let of_model = || self.model.map_or(RANGE_NOISE_M, |model| model.spec().range_noise_m);
             let noise_m = self.range_noise_m.unwrap_or_else(of_model);
             let deviations_m = series.of_rings.deviations(scan);
-            newest.sweep.set_scan_deviations(scan, &self.mount, deviations_m, noise_m, self.filter.as_ref());
+            sweep.set_scan_deviations(scan, &self.mount, deviations_m, noise_m, self.filter.as_ref());
         }
         newest.no_returns.clear();
         if self.finds_no_returns {

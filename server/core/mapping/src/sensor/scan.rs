@@ -2,6 +2,8 @@
 //!
 //! [`crate::sensor::pipeline`] writes it; fusion and the layers read it.
 
+use std::sync::Arc;
+
 use nalgebra::Isometry3;
 
 use crate::event_time::EventTime;
@@ -30,7 +32,9 @@ pub(crate) struct SensorScan {
     /// Angle between the sensor's z axis and the vertical, radians.
     pub tilt_rad: f32,
     /// Points, ego frame at `end_ns`.
-    pub sweep: Sweep,
+    pub sweep: Arc<Sweep>,
+    /// Memory for the points of the next scan, while a map holds those of this one.
+    spare: Arc<Sweep>,
     /// Directions (unit vectors) of the rays without a return, ego frame at `end_ns`; empty unless a layer needs them.
     pub no_returns: Vec<[f32; 3]>,
     /// What moved the points to `end_ns`.
@@ -52,6 +56,12 @@ impl SensorScan {
             state: SensorState { name: name.into(), ..SensorState::default() },
             ..Self::default()
         }
+    }
+
+    /// The points of the next scan, to be written in place of the newest.
+    pub fn next_sweep(&mut self) -> &mut Sweep {
+        std::mem::swap(&mut self.sweep, &mut self.spare);
+        Arc::make_mut(&mut self.sweep)
     }
 
     /// True if no sensor has this index at present: the one that had it was withdrawn.
