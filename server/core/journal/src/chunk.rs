@@ -1,10 +1,9 @@
 //! One MCAP chunk -> its records. Damage of any kind is an error and never a panic.
 //!
-//! Chunks are split here, because the reader of the crate `mcap` trusts the length of a record that reaches beyond its
-//! chunk.
+//! The crate `mcap` reads records, not chunks: its `LinearReader` fills memory of the size that a chunk claims before it
+//! has decompressed a byte, reads lz4 through a C library, and its `ChunkReader` aborts at a damaged length.
 
 use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 
 use mcap::records::{ChunkHeader, MessageIndexEntry, Record, op};
@@ -16,9 +15,7 @@ pub(super) const RECORD_BYTES_MAX: usize = 256 << 20;
 /// Length of the head of a record: its kind (one byte) and its length (eight bytes).
 pub(super) const RECORD_HEAD_BYTES: usize = 9;
 /// Length of the fields of a chunk before its data, without the name of its compression.
-pub(super) const CHUNK_FIELDS_BYTES: usize = 40;
-/// Greatest length of fields that a later version of the format adds to a record. Ours.
-const ADDED_BYTES_MAX: usize = 1024;
+const CHUNK_FIELDS_BYTES: usize = 40;
 /// Length of the head of a message, its channel (two bytes), its sequence number (four) and its log time (eight).
 const MESSAGE_START_BYTES: usize = RECORD_HEAD_BYTES + 14;
 
@@ -63,17 +60,12 @@ pub(super) fn split_record<'a>(content: &mut &'a [u8]) -> Result<Record<'a>, Mca
     parse(head[0], body)
 }
 
-/// Parses a record, and refuses one whose length is not that of its fields, because its kind or its length is damaged.
+/// Parses a record, and refuses one whose fields do not fill it, because its kind or its length is damaged.
 pub(super) fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
     let record = parse(opcode, body)?;
-    let fields = fields_bytes(&record);
-    if fields.is_some_and(|fields| body.len() > fields + ADDED_BYTES_MAX) {
-        return Err(McapError::UnexpectedEof);
-    }
     let length = match &record {
         Record::Footer(_) => 20,
         Record::DataEnd(_) => 4,
-        Record::SummaryOffset(_) => 17,
         Record::MessageIndex(index) => 6 + 16 * index.records.len(),
         Record::Chunk { header, data } => CHUNK_FIELDS_BYTES + header.compression.len() + data.len(),
         _ => body.len(),
@@ -81,71 +73,13 @@ pub(super) fn parse_strictly(opcode: u8, body: &[u8]) -> Result<Record<'_>, Mcap
     if length == body.len() { Ok(record) } else { Err(McapError::UnexpectedEof) }
 }
 
-/// True if a record of this kind is longer than its known fields: a later version of the format has added some, or its
-/// length is damaged.
-pub(super) fn has_added_bytes(opcode: u8, body: &[u8]) -> bool {
-    let is_extensible = matches!(opcode, op::HEADER | op::SCHEMA | op::CHANNEL | op::METADATA | op::ATTACHMENT);
-    let record = is_extensible.then(|| parse_strictly(opcode, body).ok()).flatten();
-    record.and_then(|record| fields_bytes(&record)).is_some_and(|fields| body.len() > fields)
-}
-
-/// Length of the known fields of a record to whose end a later version of the format may add fields, and which is
-/// short.
-fn fields_bytes(record: &Record<'_>) -> Option<usize> {
-    let texts = |texts: &BTreeMap<String, String>| {
-        size_of::<u32>()
-            + texts.iter().map(|(key, value)| 2 * size_of::<u32>() + key.len() + value.len()).sum::<usize>()
-    };
-    match record {
-        Record::Header(of) => Some(8 + of.profile.len() + of.library.len()),
-        Record::Schema { header, data } => Some(14 + header.name.len() + header.encoding.len() + data.len()),
-        Record::Channel(of) => Some(12 + of.topic.len() + of.message_encoding.len() + texts(&of.metadata)),
-        Record::Metadata(of) => Some(4 + of.name.len() + texts(&of.metadata)),
-        Record::Attachment { header, data, .. } => Some(36 + header.name.len() + header.media_type.len() + data.len()),
-        _ => None,
-    }
-}
-
 /// True if an entry of a chunk's index leads to a message of this channel with the entry's time.
 pub(super) fn is_message(content: &[u8], channel_id: u16, entry: &MessageIndexEntry) -> bool {
     let at = usize::try_from(entry.offset).ok();
-    let message = at.and_then(|at| content.get(at..)?.get(..MESSAGE_START_BYTES));
-    message.is_some_and(|bytes| message_of(bytes) == Some((channel_id, entry.log_time)))
-}
-
-/// The body of the index of the messages of this channel, in their order in the chunk.
-pub(super) fn index_of(content: &[u8], channel_id: u16) -> Vec<u8> {
-    let mut entries = Vec::new();
-    for (at, _, log_time) in messages(content).filter(|(_, channel, _)| *channel == channel_id) {
-        entries.extend(log_time.to_le_bytes());
-        entries.extend((at as u64).to_le_bytes());
-    }
-    let length = u32::try_from(entries.len()).unwrap_or(u32::MAX);
-    [&channel_id.to_le_bytes()[..], &length.to_le_bytes(), &entries].concat()
-}
-
-/// The channels of the messages of a chunk.
-pub(super) fn channels_of(content: &[u8]) -> BTreeSet<u16> {
-    messages(content).map(|(_, channel, _)| channel).collect()
-}
-
-/// Position, channel and log time of each message of a chunk.
-fn messages(content: &[u8]) -> impl Iterator<Item = (usize, u16, u64)> {
-    let mut next = 0_usize;
-    let heads = std::iter::from_fn(move || {
-        let (at, bytes) = (next, content.get(next..)?.get(..MESSAGE_START_BYTES)?);
-        let length = u64::from_le_bytes(bytes[1..RECORD_HEAD_BYTES].try_into().expect("eight bytes"));
-        next = at.saturating_add(RECORD_HEAD_BYTES).saturating_add(usize::try_from(length).unwrap_or(usize::MAX));
-        Some((at, bytes))
-    });
-    heads.filter_map(|(at, bytes)| message_of(bytes).map(|(channel, log_time)| (at, channel, log_time)))
-}
-
-/// The channel and the log time of the message that starts with these bytes; `None` if it is another record.
-fn message_of(bytes: &[u8]) -> Option<(u16, u64)> {
-    let fields = bytes.get(RECORD_HEAD_BYTES..).filter(|_| bytes[0] == op::MESSAGE)?;
-    let channel_id = u16::from_le_bytes(fields[..2].try_into().ok()?);
-    Some((channel_id, u64::from_le_bytes(fields[6..14].try_into().ok()?)))
+    let Some(head) = at.and_then(|at| content.get(at..)?.first_chunk::<MESSAGE_START_BYTES>()) else { return false };
+    head[0] == op::MESSAGE
+        && head[RECORD_HEAD_BYTES..RECORD_HEAD_BYTES + 2] == channel_id.to_le_bytes()
+        && head[RECORD_HEAD_BYTES + 6..] == entry.log_time.to_le_bytes()
 }
 
 /// The name of an attachment, from the body of its record; `None` if it has none that can be read.
@@ -156,7 +90,7 @@ pub(super) fn attachment_name(body: &[u8]) -> Option<String> {
 }
 
 /// Parses a record. Refuses an attachment that ends before its CRC, at which `mcap` would panic.
-pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
+fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
     let text_end = |at: usize| {
         let length = body.get(at..at.checked_add(4)?)?;
         (at + 4).checked_add(u32::from_le_bytes(length.try_into().ok()?) as usize)
@@ -167,16 +101,6 @@ pub(super) fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
         return Err(McapError::UnexpectedEof);
     }
     parse_record(opcode, body)
-}
-
-/// The number of four bytes at this position.
-pub(super) fn u32_at(bytes: &[u8], at: usize) -> u32 {
-    u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
-}
-
-/// The number of eight bytes at this position.
-pub(super) fn u64_at(bytes: &[u8], at: usize) -> u64 {
-    u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes"))
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! A file -> its records, by the kind of the file: MCAP, or a ROS 2 bag in sqlite.
 
-use std::io::{Error, ErrorKind, Read, Seek};
+use std::io::{Error, ErrorKind, Read};
 use std::path::Path;
 
 use mcap::records::Record;
@@ -8,7 +8,7 @@ use mcap::records::Record;
 #[cfg(feature = "sqlite")]
 use super::bag_records::BagRecords;
 use super::damage::LostPart;
-use super::mcap_records::{McapRecords, RecordsError};
+use super::mcap_records::{FileEnd, McapRecords, McapSource, RecordsError};
 use crate::file_advice::open_to_read;
 
 /// First bytes of a bag in sqlite.
@@ -23,21 +23,25 @@ pub(super) enum FileRecords {
 
 impl FileRecords {
     /// Opens a file. With `any_start`, wrong first bytes are damage and not an error.
-    pub(super) fn open(path: &Path, any_start: bool) -> Result<Self, Error> {
+    pub(super) fn open(path: &Path, any_start: bool) -> Result<Self, RecordsError> {
         let mut file = open_to_read(path)?;
         let metadata = file.metadata()?;
         if metadata.is_file() && metadata.len() == 0 {
-            return Err(Error::new(ErrorKind::UnexpectedEof, "the file is empty"));
+            return Err(Error::new(ErrorKind::UnexpectedEof, "the file is empty").into());
         }
         if metadata.is_file() {
             let mut start = Vec::new();
             (&mut file).take(SQLITE.len() as u64).read_to_end(&mut start)?;
             if start == SQLITE {
-                return bag(path);
+                return Ok(bag(path)?);
             }
-            file.rewind()?;
         }
-        Ok(Self::Mcap(Box::new(McapRecords::new(file, any_start))))
+        Self::of_mcap(file, any_start)
+    }
+
+    /// The records of an MCAP file.
+    pub(super) fn of_mcap(source: impl McapSource + 'static, any_start: bool) -> Result<Self, RecordsError> {
+        Ok(Self::Mcap(Box::new(McapRecords::open(Box::new(source), any_start)?)))
     }
 
     /// Number of bytes read so far.
@@ -49,39 +53,14 @@ impl FileRecords {
         }
     }
 
-    /// True if the file was read to an end that its writer has made.
-    pub(super) fn has_end(&self) -> bool {
+    /// How the file ends, as far as it is read.
+    pub(super) fn end(&self) -> FileEnd {
         match self {
-            Self::Mcap(records) => records.has_footer(),
+            Self::Mcap(records) => records.end(),
             #[cfg(feature = "sqlite")]
-            Self::Bag(records) => records.has_end(),
-        }
-    }
-
-    /// True if the file was read to the end of its data.
-    pub(super) fn has_data_end(&self) -> bool {
-        match self {
-            Self::Mcap(records) => records.has_data_end(),
-            #[cfg(feature = "sqlite")]
-            Self::Bag(records) => records.has_end(),
-        }
-    }
-
-    /// True if bytes follow the end that its writer has made.
-    pub(super) fn has_more(&self) -> bool {
-        match self {
-            Self::Mcap(records) => records.has_more(),
-            #[cfg(feature = "sqlite")]
-            Self::Bag(_) => false,
-        }
-    }
-
-    /// True if the file's own counts can be trusted.
-    pub(super) fn has_sound_counts(&self) -> bool {
-        match self {
-            Self::Mcap(records) => records.has_sound_summary(),
-            #[cfg(feature = "sqlite")]
-            Self::Bag(_) => false,
+            Self::Bag(records) => {
+                FileEnd { is_closed: records.has_end(), has_all_data: records.has_end(), ..FileEnd::default() }
+            }
         }
     }
 
@@ -91,6 +70,15 @@ impl FileRecords {
             Self::Mcap(records) => records.lost(),
             #[cfg(feature = "sqlite")]
             Self::Bag(records) => records.lost(),
+        }
+    }
+
+    /// The schemas and channels that the end of the file repeats; a second call returns none.
+    pub(super) fn take_described(&mut self) -> Vec<Record<'static>> {
+        match self {
+            Self::Mcap(records) => records.take_described(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(_) => Vec::new(),
         }
     }
 

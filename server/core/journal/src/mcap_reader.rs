@@ -6,7 +6,6 @@
 //! damaged as a whole.
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
-use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -23,12 +22,12 @@ use super::channel::{Channel, Content};
 use super::damage::Damage;
 use super::file_records::FileRecords;
 use super::header::{FORMAT, Format};
-use super::mcap_records::{McapRecords, RecordsError};
-use super::mcap_summary;
+use super::mcap_records::RecordsError;
 use super::message_order::MessageOrder;
 use super::record_counts::RecordCounts;
 
 pub use super::header::Header;
+pub use super::mcap_records::McapSource;
 
 /// The name of the metadata that a repaired file has at each place at which a part of the damaged file is lost.
 pub(super) const REPAIR_METADATA: &str = "clearway-repair";
@@ -133,8 +132,6 @@ pub enum McapReadError {
 pub struct McapReader {
     file: PathBuf,
     records: FileRecords,
-    /// True if `file` can be opened to read its summary.
-    has_path: bool,
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Arc<Channel>>,
     header: Header,
@@ -160,33 +157,31 @@ impl McapReader {
     /// [`McapReadError::Read`] if the file cannot be read, [`McapReadError::NotMcap`] if it is not an MCAP file,
     /// [`McapReadError::Version`] if a later version of clearway wrote it.
     pub fn open(file: &Path) -> Result<Self, McapReadError> {
-        Self::new(file, open(file, false)?, true)
+        Self::unread(file, FileRecords::open(file, false))?.with_first()
     }
 
     /// Reads an MCAP file from `source`, up to its first message; errors name it `file`.
     ///
     /// # Errors
     /// As [`McapReader::open`].
-    pub fn from_source(file: &Path, source: impl Read + Send + 'static) -> Result<Self, McapReadError> {
-        Self::new(file, FileRecords::Mcap(Box::new(McapRecords::new(source, false))), false)
+    pub fn from_source(file: &Path, source: impl McapSource + 'static) -> Result<Self, McapReadError> {
+        Self::unread(file, FileRecords::of_mcap(source, false))?.with_first()
     }
 
     /// Opens a file to read its records; its first bytes may be damaged too.
     pub(super) fn open_any(file: &Path) -> Result<Self, McapReadError> {
-        Ok(Self::unread(file, open(file, true)?, true))
+        Self::unread(file, FileRecords::open(file, true))
     }
 
-    fn new(file: &Path, records: FileRecords, has_path: bool) -> Result<Self, McapReadError> {
-        let mut reader = Self::unread(file, records, has_path);
-        reader.first = reader.read()?;
-        Ok(reader)
+    fn with_first(mut self) -> Result<Self, McapReadError> {
+        self.first = self.read()?;
+        Ok(self)
     }
 
-    fn unread(file: &Path, records: FileRecords, has_path: bool) -> Self {
-        Self {
+    fn unread(file: &Path, records: Result<FileRecords, RecordsError>) -> Result<Self, McapReadError> {
+        Ok(Self {
             file: file.to_owned(),
-            records,
-            has_path,
+            records: records.map_err(|error| read_error(file, error))?,
             schemas: HashMap::new(),
             channels: HashMap::new(),
             header: Header::default(),
@@ -198,7 +193,7 @@ impl McapReader {
             losses_before: 0,
             repaired: Vec::new(),
             has_ended: false,
-        }
+        })
     }
 
     /// The file's path.
@@ -218,7 +213,7 @@ impl McapReader {
 
     /// True if the file ended before its closing records, because a crash cut it. Known after the last message.
     pub fn is_cut(&self) -> bool {
-        self.has_ended && !self.records.has_end()
+        self.has_ended && !self.records.end().is_closed
     }
 
     /// The damaged parts so far.
@@ -296,7 +291,7 @@ impl McapReader {
     /// True if the faults of [`McapReader::faults_of_end`] may have cost a record. A file that is cut after its data
     /// lacks only repetitions.
     pub(super) fn is_loss_at_end(&self) -> bool {
-        let harmless = usize::from(self.is_cut() && self.records.has_data_end());
+        let harmless = usize::from(self.is_cut() && self.records.end().has_all_data);
         self.faults_of_end().len() > harmless
     }
 
@@ -309,7 +304,7 @@ impl McapReader {
 
     /// True if the file proves by its own counts that it has all messages, attachments and metadata.
     pub(super) fn has_all_records(&self) -> bool {
-        self.named_losses() == 0 && !self.records.has_more() && self.counts.are_all_there(|id| self.topic(id))
+        self.named_losses() == 0 && !self.records.end().has_more && self.counts.are_all_there(|id| self.topic(id))
     }
 
     /// True if the messages are not all there or not as they were written, by what the file says of them. Known after
@@ -355,26 +350,19 @@ impl McapReader {
     pub(super) fn next_record(&mut self) -> Result<Option<Record<'static>>, McapReadError> {
         let record = match self.waiting.pop_front() {
             Some(record) => Some(record),
-            None => self.records.next().map_err(|error| match error {
-                RecordsError::Read(source) => {
-                    McapReadError::Read { file: self.file.clone(), source: advised(&self.file, source) }
-                }
-                RecordsError::NotMcap => McapReadError::NotMcap { file: self.file.clone() },
-                RecordsError::NoRecord => McapReadError::NoRecord { file: self.file.clone() },
-            })?,
+            None => self.records.next().map_err(|error| read_error(&self.file, error))?,
         };
         let Some(mut record) = record else {
             self.has_ended = true;
-            self.counts.end(self.records.has_sound_counts(), !self.repaired.is_empty());
+            self.counts.end(self.records.end().has_sound_counts, !self.repaired.is_empty());
             return Ok(None);
         };
         let is_unknown = |id: &u16| !self.channels.contains_key(id);
         if let Record::Message { header, .. } = &record
             && is_unknown(&header.channel_id)
-            && std::mem::take(&mut self.has_path)
         {
             // The chunk that describes the channels is damaged; the summary repeats them.
-            self.waiting.extend(mcap_summary::schemas_and_channels(&self.file).unwrap_or_default());
+            self.waiting.extend(self.records.take_described());
             self.waiting.push_back(record);
             record = self.waiting.pop_front().expect("the record itself");
         }
@@ -451,7 +439,11 @@ impl Iterator for McapReader {
     }
 }
 
-fn open(file: &Path, any_start: bool) -> Result<FileRecords, McapReadError> {
-    let wrong = |source| McapReadError::Read { file: file.to_owned(), source: advised(file, source) };
-    FileRecords::open(file, any_start).map_err(wrong)
+fn read_error(file: &Path, error: RecordsError) -> McapReadError {
+    let file = file.to_owned();
+    match error {
+        RecordsError::Read(source) => McapReadError::Read { source: advised(&file, source), file },
+        RecordsError::NotMcap => McapReadError::NotMcap { file },
+        RecordsError::NoRecord => McapReadError::NoRecord { file },
+    }
 }

@@ -1,8 +1,7 @@
-//! The end of an MCAP file -> the schemas and channels that its summary repeats.
+//! The end of an MCAP file -> the schemas and channels that its summary repeats, and the places of its records.
 
-use std::fs::File;
+use std::collections::BTreeMap;
 use std::io::{self, Read, Seek, SeekFrom};
-use std::path::Path;
 
 use mcap::MAGIC;
 use mcap::records::{Record, op};
@@ -11,41 +10,75 @@ use super::chunk::{RECORD_HEAD_BYTES, split_record};
 
 /// Length of the fields of the footer.
 const FOOTER_BYTES: usize = 20;
+/// Length of the record that ends the data.
+const DATA_END_BYTES: usize = RECORD_HEAD_BYTES + 4;
 /// The head of the record that ends the data; the CRC of the data follows it.
 const DATA_END: [u8; RECORD_HEAD_BYTES] = [op::DATA_END, 4, 0, 0, 0, 0, 0, 0, 0];
 /// Greatest length of a summary that is read. Ours: a summary has about 100 bytes for each chunk.
 const SUMMARY_BYTES_MAX: u64 = 16 << 20;
 
-/// Reads the schemas and channels of the summary of a file, up to the first damage; none if the file is cut.
-///
-/// # Errors
-/// If the file cannot be read.
-pub(super) fn schemas_and_channels(file: &Path) -> io::Result<Vec<Record<'static>>> {
-    let mut file = File::open(file)?;
-    let length = file.metadata()?.len();
-    let end_bytes = RECORD_HEAD_BYTES + FOOTER_BYTES + MAGIC.len();
-    let footer_at = length.saturating_sub(end_bytes as u64);
-    file.seek(SeekFrom::Start(footer_at))?;
-    let mut end = Vec::new();
-    (&mut file).take(end_bytes as u64).read_to_end(&mut end)?;
-    let Ok(Record::Footer(footer)) = split_record(&mut &*end) else { return Ok(Vec::new()) };
-    if footer.summary_start == 0 {
-        return Ok(Vec::new());
+/// What the summary of a file says of its records.
+#[derive(Default)]
+pub(super) struct McapSummary {
+    /// The schemas and channels.
+    pub(super) described: Vec<Record<'static>>,
+    /// Position and kind of the chunks, message indexes, attachments and metadata, of the end of the data and of the
+    /// footer. In a file from which a part was cut, or that has one more, a record may be at none of them.
+    pub(super) starts: BTreeMap<u64, u8>,
+}
+
+impl McapSummary {
+    /// Reads the summary of a file up to the first damage; empty if the file is cut.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    pub(super) fn read(file: &mut (impl Read + Seek)) -> io::Result<Self> {
+        let mut summary = Self::default();
+        let length = file.seek(SeekFrom::End(0))?;
+        let footer_at = length.saturating_sub((RECORD_HEAD_BYTES + FOOTER_BYTES + MAGIC.len()) as u64);
+        let Ok(Record::Footer(footer)) = split_record(&mut &read(file, footer_at, length)?[..]) else {
+            return Ok(summary);
+        };
+        summary.starts.insert(footer_at, op::FOOTER);
+        let earliest = footer_at.saturating_sub(SUMMARY_BYTES_MAX);
+        // The footer is wrong about where the summary begins if a part of the file was cut out.
+        let stated = footer.summary_start.saturating_sub(DATA_END_BYTES as u64);
+        for from in [stated, earliest].into_iter().filter(|from| (earliest..footer_at).contains(from)) {
+            let tail = read(file, from, footer_at)?;
+            let Some(at) = tail.windows(DATA_END.len()).rposition(|bytes| bytes == DATA_END) else { continue };
+            let data_end = from + at as u64;
+            summary.starts.insert(data_end, op::DATA_END);
+            let is_moved_by = (data_end + DATA_END_BYTES as u64).wrapping_sub(footer.summary_start);
+            summary.add(tail.get(at + DATA_END_BYTES..).unwrap_or_default(), is_moved_by);
+            break;
+        }
+        Ok(summary)
     }
-    let from = footer_at.saturating_sub(SUMMARY_BYTES_MAX);
-    file.seek(SeekFrom::Start(from))?;
-    let mut tail = Vec::new();
-    file.take(footer_at - from).read_to_end(&mut tail)?;
-    // The summary begins behind the end of the data. The footer is wrong about where, if a part was cut out.
-    let ends = tail.windows(DATA_END.len()).rposition(|bytes| bytes == DATA_END);
-    let Some(mut rest) = ends.and_then(|end| tail.get(end + DATA_END.len() + size_of::<u32>()..)) else {
-        return Ok(Vec::new());
-    };
-    let mut described = Vec::new();
-    while let Ok(record) = split_record(&mut rest) {
-        if matches!(record, Record::Schema { .. } | Record::Channel(_)) {
-            described.push(record.into_owned());
+
+    /// Adds the records of a summary, which stands so many bytes behind the place that its file states.
+    fn add(&mut self, mut records: &[u8], is_moved_by: u64) {
+        while let Ok(record) = split_record(&mut records) {
+            let mut add = |at: u64, kind| {
+                self.starts.extend([(at, kind), (at.wrapping_add(is_moved_by), kind)]);
+            };
+            match &record {
+                Record::ChunkIndex(index) => {
+                    add(index.chunk_start_offset, op::CHUNK);
+                    index.message_index_offsets.values().for_each(|at| add(*at, op::MESSAGE_INDEX));
+                }
+                Record::AttachmentIndex(index) => add(index.offset, op::ATTACHMENT),
+                Record::MetadataIndex(index) => add(index.offset, op::METADATA),
+                Record::Schema { .. } | Record::Channel(_) => self.described.push(record.into_owned()),
+                _ => {}
+            }
         }
     }
-    Ok(described)
+}
+
+/// The bytes of a file from one position to another.
+fn read(file: &mut (impl Read + Seek), from: u64, to: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    file.seek(SeekFrom::Start(from))?;
+    file.take(to.saturating_sub(from)).read_to_end(&mut bytes)?;
+    Ok(bytes)
 }

@@ -2,7 +2,6 @@
 //! configuration of the recorded run.
 
 use std::error::Error;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
@@ -15,7 +14,7 @@ use prost::Message as _;
 
 use super::channel::Content;
 use super::damage::Damage;
-use super::mcap_reader::{Header, McapReadError, McapReader, Message};
+use super::mcap_reader::{Header, McapReadError, McapReader, McapSource, Message};
 use crate::RecordedMaps;
 use crate::encode::{EventDecodeError, event_from_bytes};
 
@@ -162,7 +161,7 @@ impl RecordingReader {
     ///
     /// # Errors
     /// As [`RecordingReader::open`].
-    pub fn from_source(file: &Path, source: impl Read + Send + 'static) -> Result<Self, RecordingError> {
+    pub fn from_source(file: &Path, source: impl McapSource + 'static) -> Result<Self, RecordingError> {
         Ok(Self { reader: McapReader::from_source(file, source)?, has_ended: false })
     }
 
