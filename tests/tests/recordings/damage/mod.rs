@@ -91,19 +91,19 @@ fn read_whole(file: &Path) {
 fn a_cut_at_any_byte_is_named_and_loses_no_whole_chunk() {
     let original = Original::read(in_chunks()).unwrap();
     assert!(original.chunks() > 5, "{} chunks", original.chunks());
-    // Every byte around the records, and a sample between them; `cuts_and_flips` cuts at every byte.
-    let (length, near) = (original.length(), original.near_records(12));
-    for cut in (0..length).step_by(7919).chain(near) {
+    // A sample; `cuts_and_flips` cuts at every byte.
+    let (length, near) = (original.length(), original.near_records(1));
+    for cut in (0..length).step_by(60_013).chain(near) {
         original.cut(cut).unwrap_or_else(|error| panic!("cut after {cut} bytes: {error}"));
     }
     let folder = tempfile::tempdir().unwrap();
     let mut repaired = 0;
     // As many cuts of a recording of any length.
-    for cut in (0..length).step_by(length / 40) {
+    for cut in (0..length).step_by(length / 12) {
         let outcome = original.repair_cut(cut, folder.path());
         repaired += u64::from(outcome.unwrap_or_else(|error| panic!("cut after {cut} bytes: {error}")).repaired);
     }
-    assert!(repaired > 20, "{repaired} repaired copies verify");
+    assert!(repaired > 5, "{repaired} repaired copies verify");
 }
 
 #[test]
@@ -111,10 +111,10 @@ fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
     let folder = tempfile::tempdir().unwrap();
     let original = Original::read(in_chunks()).unwrap();
     let copy = original.copy(&folder.path().join("changed.mcap")).unwrap();
-    let mut runner = TestRunner::new(ProptestConfig { cases: 150, ..ProptestConfig::default() });
+    let mut runner = TestRunner::new(ProptestConfig { cases: 24, ..ProptestConfig::default() });
     let change = (0..original.length(), 0..8_u8);
     runner.run(&change, |(at, bit)| copy.flip(&original, at, bit).map(drop).map_err(TestCaseError::fail)).unwrap();
-    // The heads of the records have few of all bytes, but all of the framing.
+    // The heads of some records have few of all bytes, but all of the framing.
     let bytes = in_chunks();
     // The name of the metadata, a digit of its boot id, and the kind of the record that ends the data: no checksum but
     // that of the whole section covers them.
@@ -128,7 +128,8 @@ fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
     for bit in 0..8 {
         copy.flip(&original, data_end, bit).unwrap_or_else(|error| panic!("the end of the data: {error}"));
     }
-    for at in records(&bytes, op::CHUNK).into_iter().chain(records(&bytes, op::MESSAGE_INDEX)) {
+    let (chunks, indexes) = (records(&bytes, op::CHUNK), records(&bytes, op::MESSAGE_INDEX));
+    for at in [chunks[0], chunks[chunks.len() / 2], indexes[indexes.len() / 2]] {
         for (byte, bit) in [(at, 0), (at, 7), (at + 1, 3), (at + 4, 1), (at + 8, 6), (at + 9 + 16, 2)] {
             copy.flip(&original, byte, bit).unwrap();
         }
@@ -251,12 +252,12 @@ fn a_repair_without_a_loss_ends_with_success() {
     });
     assert!(said.contains("a message index does not agree with its chunk"), "{said}");
     assert!(code == Some(0) && said.contains(&format!("\"messages\": {all},")), "{code:?}: {said}");
-    // Any bit of an index.
+    // Some bits of an index, and all of its head.
     let bytes = in_chunks();
     let indexes = records(&bytes, op::MESSAGE_INDEX);
     let lengths = indexes.windows(2).skip(2).map(|pair| (pair[1] - pair[0], pair[0]));
     let (length, index) = lengths.min().unwrap();
-    for bit in 0..length * 8 {
+    for bit in (0..72).chain((72..length * 8).step_by(37)) {
         let mut bytes = bytes.clone();
         bytes[index + bit / 8] ^= 1 << (bit % 8);
         let mut reader = McapReader::from_source(Path::new("damaged.mcap"), std::io::Cursor::new(bytes)).unwrap();
@@ -342,7 +343,7 @@ fn a_record_with_a_wrong_length_costs_that_record() {
     let all = McapReader::open(&golden()).unwrap().count();
     for kind in [op::HEADER, op::METADATA, op::ATTACHMENT] {
         // Its length: the record then ends some bytes, or some chunks, before or after its end.
-        for (byte, bit) in [(1, 0), (1, 1), (1, 3), (1, 7), (2, 0), (2, 5), (3, 0)] {
+        for (byte, bit) in [(1, 0), (1, 7), (2, 5)] {
             let (said, code) = repaired(|bytes| {
                 let record = records(bytes, kind)[0];
                 bytes[record + byte] ^= 1 << bit;
