@@ -142,7 +142,8 @@ def test_a_reader_at_two_routers_at_once_reads_through_either(lone_routers):
 def test_a_dead_router_before_a_live_one_costs_a_reader_no_maps(lone_routers):
     (first, near), (second, far) = lone_routers
     first.close()
-    published(second).put(part(1))
+    publisher = published(second)
+    publisher.put(part(1))
     for endpoints in (f"{near},{far}", f"{near}+{far}"):
         with watch(endpoints) as maps:
             assert counts(next(maps)) == (1, 0, 0), endpoints
