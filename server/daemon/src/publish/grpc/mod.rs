@@ -129,16 +129,12 @@ impl Maps {
             Ok(served) => return Ok(served),
             Err(unknown) => unknown,
         };
-        let elsewhere = self.fleet.address_of(name, Instant::now()).filter(|_| caller.may_reach(name));
-        let Some((address, value)) = elsewhere.and_then(|address| Some((address.clone(), address.parse().ok()?)))
-        else {
-            let servers = self.fleet.servers_of(name, Instant::now());
-            return Err(match servers.first().filter(|_| caller.may_reach(name)) {
-                Some(server) => Status::not_found(format!(
-                    "vehicle {name:?} is served by {server:?}, which announces no address: set grpc.advertise there"
-                )),
-                None => unknown.into(),
-            });
+        let elsewhere = self.fleet.find(name, Instant::now()).filter(|_| caller.may_reach(name));
+        let Some(v1::Vehicle { server, grpc: address, .. }) = elsewhere else { return Err(unknown.into()) };
+        let Some(value) = address.parse().ok().filter(|_| !address.is_empty()) else {
+            return Err(Status::not_found(format!(
+                "vehicle {name:?} is served by {server:?}, which announces no address: set grpc.advertise there"
+            )));
         };
         let mut led = Status::not_found(format!("vehicle {name:?} is served at {address}"));
         led.metadata_mut().insert(SERVED_AT, value);
