@@ -77,7 +77,7 @@ fn parts(folder: &Path) -> Result<Vec<PathBuf>> {
 async fn send_all(options: &UploadArguments, store: &dyn ObjectStore) -> Result<u64> {
     let mut failed = 0;
     for part in parts(&options.folder)? {
-        match upload::upload(store, &part).await {
+        match upload::upload(store, &part, None).await {
             Ok(confirmation) => {
                 let bytes = counted(confirmation.bytes, "byte");
                 print_line(&format!("{} is confirmed: {bytes}, {}", part.display(), confirmation.part))?;

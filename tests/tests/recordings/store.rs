@@ -139,7 +139,7 @@ async fn a_part_is_deleted_only_if_it_is_the_part_that_was_confirmed() {
     let part = recordings(folder.path(), &["drive.mcap"]).join("drive.mcap");
     let store = location::open(folder.path().join("store").to_str().unwrap()).unwrap();
     assert!(!upload::delete_confirmed(&part).unwrap(), "it is not confirmed");
-    let confirmation = upload::upload(&*store, &part).await.unwrap();
+    let confirmation = upload::upload(&*store, &part, None).await.unwrap();
     let expected = Entry::of_part(&part, confirmation.bytes, confirmation.crc32).unwrap();
     assert_eq!(search(&*store, &Search::default()).await.unwrap().entries, expected);
     assert_eq!((expected[0].events, expected[0].layers), (172, 18));

@@ -1,6 +1,6 @@
 //! Finished parts of the recording -> the store of the configuration, confirmed, while the server runs.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -11,7 +11,7 @@ use object_store::{ObjectStore, ObjectStoreExt};
 use crate::config::Store;
 use crate::record::writer::{RecorderControl, RecorderCounts};
 use crate::store::location;
-use crate::store::upload::{self, Prepared, UploadError};
+use crate::store::upload::{self, UploadError};
 use crate::store::upload_limit::UploadLimit;
 
 /// Time between two looks for finished parts, and the first between two attempts with a store that is away; each
@@ -47,8 +47,6 @@ struct Uploads {
     answer_timeout: Duration,
     /// Parts that the store has confirmed, and those without an event or a map.
     settled: BTreeSet<Seen>,
-    /// Parts that wait, as they were read: a store that is away costs no second reading.
-    prepared: BTreeMap<Seen, Prepared>,
 }
 
 /// Sends each finished part to the store until the task is aborted. What the store does not confirm
@@ -100,9 +98,8 @@ fn period_after(period: Duration, problem: Option<&Problem>) -> Duration {
 
 impl Uploads {
     fn new(options: Store, saved: Duration, control: RecorderControl, counts: Arc<RecorderCounts>) -> Self {
-        let (store, settled, prepared) = (None, BTreeSet::new(), BTreeMap::new());
         let (limit, answer_timeout) = (UploadLimit::new(options.upload_kbit_s_max), ANSWER_TIMEOUT);
-        Self { options, saved, control, counts, store, limit, answer_timeout, settled, prepared }
+        Self { options, saved, control, counts, store: None, limit, answer_timeout, settled: BTreeSet::new() }
     }
 
     /// Sends the parts that wait, up to the first that the store refuses.
@@ -115,7 +112,7 @@ impl Uploads {
         self.counts.set_waiting_for_store(left);
         let mut outcome = Ok(());
         for (part, seen) in waiting {
-            match self.upload(&part, &seen).await {
+            match self.upload(&part).await {
                 Ok(is_new) => {
                     left -= 1;
                     if is_new {
@@ -123,7 +120,6 @@ impl Uploads {
                         tracing::info!(part = %part.display(), "the store has confirmed a part");
                     }
                     self.counts.set_waiting_for_store(left);
-                    self.prepared.remove(&seen);
                     self.settled.insert(seen);
                 }
                 Err(problem) => {
@@ -176,15 +172,7 @@ impl Uploads {
     }
 
     /// Sends one part. Returns false if it has nothing that could be found again; then it stays where it is.
-    async fn upload(&mut self, part: &Path, seen: &Seen) -> Result<bool, Problem> {
-        let of_part = |error: UploadError| Problem::Part(error.to_string());
-        if !self.prepared.contains_key(seen) {
-            match upload::prepare(part) {
-                Ok(prepared) => _ = self.prepared.insert(seen.clone(), prepared),
-                Err(UploadError::Nothing { .. }) => return Ok(false),
-                Err(error) => return Err(of_part(error)),
-            }
-        }
+    async fn upload(&mut self, part: &Path) -> Result<bool, Problem> {
         let store = match &self.store {
             Some(store) => store.clone(),
             None => {
@@ -199,12 +187,14 @@ impl Uploads {
             let reason = format!("{} has not answered for {:?}", self.options.url, self.answer_timeout);
             return Err(Problem::Store(reason));
         }
-        let uploaded = upload::upload_prepared(&*store, part, &self.prepared[seen], self.limit.as_ref()).await;
-        uploaded.map_err(|error| match error {
-            UploadError::Store { .. } | UploadError::Differs { .. } => Problem::Store(error.to_string()),
-            error => of_part(error),
-        })?;
-        Ok(true)
+        match upload::upload(&*store, part, self.limit.as_ref()).await {
+            Ok(_) => Ok(true),
+            Err(UploadError::Nothing { .. }) => Ok(false),
+            Err(error @ (UploadError::Store { .. } | UploadError::Differs { .. })) => {
+                Err(Problem::Store(error.to_string()))
+            }
+            Err(error) => Err(Problem::Part(error.to_string())),
+        }
     }
 }
 
@@ -271,11 +261,10 @@ mod tests {
         println!("{} attempts in an hour without the store", away.store_failures);
         assert_eq!((away.store_confirmed, away.store_waiting), (1, 3), "{away:?}");
         assert!((60..70).contains(&away.store_failures), "{away:?}");
-        assert_eq!(uploads.prepared.len(), 1, "one part is read, once");
         std::fs::remove_file(at("store")).unwrap();
         std::fs::rename(at("kept"), at("store")).unwrap();
         assert!(uploads.upload_all().await.is_ok());
-        assert_eq!((counts.to_proto().store_confirmed, uploads.prepared.len()), (4, 0));
+        assert_eq!(counts.to_proto().store_confirmed, 4);
         // A part without an event has nothing that could be found again: it stays, and nothing waits for it.
         drop(handles);
         recorder.finish().unwrap();

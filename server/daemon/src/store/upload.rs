@@ -35,15 +35,6 @@ pub struct Confirmation {
     pub crc32: u32,
 }
 
-/// What the store gets of a finished part beside its bytes.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Prepared {
-    bytes: u64,
-    crc32: u32,
-    /// One for each vehicle, at least one.
-    entries: Vec<Entry>,
-}
-
 /// A part is not confirmed. It stays where it is.
 #[derive(Debug, thiserror::Error)]
 pub enum UploadError {
@@ -101,49 +92,29 @@ pub fn reason(error: &object_store::Error) -> String {
     format!("{} {}", before.trim_end(), stated.join(": ")).trim_end().to_owned()
 }
 
-/// Sends a finished part to the store, confirms it there, and writes its confirmation beside it. Sending a part again
-/// changes nothing.
+/// Sends a finished part to the store, reads it back within the limit, and writes its confirmation beside it. Sending a
+/// part again changes nothing.
 ///
 /// # Errors
 /// [`UploadError`]; the part is then not confirmed.
-pub async fn upload(store: &dyn ObjectStore, finished_part: &Path) -> Result<Confirmation, UploadError> {
-    upload_prepared(store, finished_part, &prepare(finished_part)?, None).await
-}
-
-/// Reads a finished part for [`upload_prepared`].
-///
-/// # Errors
-/// [`UploadError::Read`] and [`UploadError::Recording`] if it cannot be read, [`UploadError::Nothing`] if it is empty.
-pub fn prepare(file: &Path) -> Result<Prepared, UploadError> {
-    let (bytes, crc32) = crc_of(file).map_err(|source| UploadError::Read { file: file.to_owned(), source })?;
-    let entries = Entry::of_part(file, bytes, crc32)?;
-    if entries.is_empty() {
-        return Err(UploadError::Nothing { file: file.to_owned() });
-    }
-    Ok(Prepared { bytes, crc32, entries })
-}
-
-/// As [`upload`], for a part that was prepared and has not changed since, and is read back within the limit.
-///
-/// # Errors
-/// As [`upload`].
-pub async fn upload_prepared(
+pub async fn upload(
     store: &dyn ObjectStore,
     file: &Path,
-    prepared: &Prepared,
     limit: Option<&UploadLimit>,
 ) -> Result<Confirmation, UploadError> {
     let read = |source| UploadError::Read { file: file.to_owned(), source };
     let refused = |source| UploadError::Store { file: file.to_owned(), source };
-    let Prepared { bytes, crc32, entries } = prepared;
-    let (bytes, crc32, part) = (*bytes, *crc32, entries[0].part.clone());
+    let (bytes, crc32) = crc_of(file).map_err(read)?;
+    let entries = Entry::of_part(file, bytes, crc32)?;
+    let first = entries.first().ok_or_else(|| UploadError::Nothing { file: file.to_owned() })?;
+    let part = first.part.clone();
     let key = Key::from(part.as_str());
     send(store, &key, file).await?;
     let found = crc_in_store(store, &key, limit).await.map_err(refused)?;
     if found != (bytes, crc32) {
         return Err(UploadError::Differs { file: file.to_owned(), part, sent: crc32, found: found.1 });
     }
-    for entry in entries {
+    for entry in &entries {
         let json = serde_json::to_vec_pretty(entry).expect("an entry has only text and numbers");
         store.put(&entry.key(), json.into()).await.map_err(refused)?;
     }
