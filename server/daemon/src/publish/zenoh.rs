@@ -251,7 +251,10 @@ async fn subscribe_while(
 }
 
 /// Reads the key that signs maps; `None` if the path is empty.
-fn signing_key(file: &Path) -> Result<Option<SigningKey>, ZenohError> {
+///
+/// # Errors
+/// [`ZenohError`] if it cannot be read or is no key.
+pub fn signing_key(file: &Path) -> Result<Option<SigningKey>, ZenohError> {
     if file.as_os_str().is_empty() {
         return Ok(None);
     }

@@ -30,6 +30,8 @@ pub(super) struct Users {
     pub fleet: Fleet,
     /// The address at which gRPC listens.
     pub grpc: Option<SocketAddr>,
+    /// The recorder, if the server records.
+    pub recorder: Option<RecorderControl>,
 }
 
 /// The open session and its users.
@@ -47,13 +49,14 @@ pub(super) struct OverZenoh {
 }
 
 impl OverZenoh {
-    /// Publishes all vehicles on an open session, and subscribes to their observations and ROS 2 topics. Announces the
-    /// vehicles with the address at which gRPC listens, and fills the fleet with those of others.
+    /// Publishes all vehicles on an open session, subscribes to their observations and ROS 2 topics, and answers the
+    /// queries of operators to the recorder. Announces the vehicles with the address at which gRPC listens, and fills
+    /// the fleet with the vehicles of others.
     ///
     /// # Errors
     /// [`ZenohError`] if a key cannot be declared.
     pub(super) async fn start(session: Session, users: &Users) -> Result<Self, ZenohError> {
-        let Users { config, vehicles, gateways, queues, fleet, grpc } = users;
+        let Users { config, vehicles, gateways, queues, fleet, grpc, recorder: control } = users;
         let publisher = Publisher::start(&session, &config.zenoh, vehicles).await?;
         let mut announcements = JoinSet::new();
         if config.zenoh.fleet.announce {
@@ -64,37 +67,19 @@ impl OverZenoh {
             true => Some(announcements::hear(&session, fleet.clone()).await?),
             false => None,
         };
-        let (ingest, ros, recorder) = (JoinSet::new(), Vec::new(), JoinSet::new());
-        let mut over_zenoh = Self { session, publisher, ingest, ros, announcements, recorder, _fleet: others };
+        let (mut ingest, mut ros, mut recorder) = (JoinSet::new(), Vec::new(), JoinSet::new());
         for gateway in gateways.all() {
-            let senders = senders(&over_zenoh.session, config);
-            let ingest = Ingest::subscribe(&over_zenoh.session, gateway.clone(), senders).await?;
-            over_zenoh.ingest.spawn(ingest.run());
+            let subscribed = Ingest::subscribe(&session, gateway.clone(), senders(&session, config)).await?;
+            ingest.spawn(subscribed.run());
         }
         for (vehicle, queue) in config.vehicles.iter().zip(queues) {
-            let Some(ros) = &vehicle.ros else { continue };
+            let operators = senders(&session, config);
+            zenoh_recorder::serve(&session, &vehicle.name, control.clone(), operators, &mut recorder).await?;
+            let Some(topics) = &vehicle.ros else { continue };
             let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
-            let topics = live::subscribe(&over_zenoh.session, ros, &vehicle.name, sensors, queue.clone()).await?;
-            over_zenoh.ros.push(topics);
+            ros.push(live::subscribe(&session, topics, &vehicle.name, sensors, queue.clone()).await?);
         }
-        Ok(over_zenoh)
-    }
-
-    /// Answers the queries of operators to the recorder, on the keys of each vehicle.
-    ///
-    /// # Errors
-    /// [`ZenohError`] if a key cannot be declared.
-    pub(super) async fn serve_recorder(
-        &mut self,
-        config: &Config,
-        control: Option<&RecorderControl>,
-    ) -> Result<(), ZenohError> {
-        for vehicle in &config.vehicles {
-            let operators = senders(&self.session, config);
-            zenoh_recorder::serve(&self.session, &vehicle.name, control.cloned(), operators, &mut self.recorder)
-                .await?;
-        }
-        Ok(())
+        Ok(Self { session, publisher, ingest, ros, announcements, recorder, _fleet: others })
     }
 
     /// True if the session is connected to a router.

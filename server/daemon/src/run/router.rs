@@ -10,7 +10,6 @@ use tokio::sync::Mutex;
 
 use super::over_zenoh::{OverZenoh, Users};
 use crate::publish::Vehicles;
-use crate::record::writer::RecorderControl;
 use crate::status::network::Away;
 use crate::zenoh_session;
 
@@ -24,12 +23,7 @@ const ASK_TIMEOUT: Duration = Duration::from_secs(2);
 pub(super) type Connected = Arc<Mutex<Option<OverZenoh>>>;
 
 /// Opens the session as soon as a router answers, and starts what uses it.
-pub(super) async fn connect(
-    settings: zenoh::Config,
-    users: Users,
-    control: Option<RecorderControl>,
-    connected: Connected,
-) {
+pub(super) async fn connect(settings: zenoh::Config, users: Users, connected: Connected) {
     let session = loop {
         match zenoh_session::open(settings.clone(), &users.config.zenoh).await {
             Ok(session) => break session,
@@ -37,12 +31,7 @@ pub(super) async fn connect(
         }
         tokio::time::sleep(PERIOD).await;
     };
-    let started = async {
-        let mut over_zenoh = OverZenoh::start(session, &users).await?;
-        over_zenoh.serve_recorder(&users.config, control.as_ref()).await?;
-        Ok::<_, zenoh_session::ZenohError>(over_zenoh)
-    };
-    match started.await {
+    match OverZenoh::start(session, &users).await {
         Ok(over_zenoh) => *connected.lock().await = Some(over_zenoh),
         Err(error) => tracing::error!(%error, "no maps over zenoh"),
     }

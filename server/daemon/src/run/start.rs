@@ -37,6 +37,8 @@ use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
 use crate::ingest::udp;
 use crate::publish::listen::security::{Current, Security};
 use crate::publish::listen::{Listener, ListenerHandle};
+#[cfg(feature = "zenoh")]
+use crate::publish::zenoh::signing_key;
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
 use crate::record::writer::{Recorder, recording_path};
 use crate::status::network::end_text;
@@ -158,21 +160,11 @@ impl Running {
         drop(held);
         let gateways = self.gateways(config);
         #[cfg(feature = "zenoh")]
-        let mut unconnected = None;
-        #[cfg(feature = "zenoh")]
-        if config.zenoh.enabled {
-            unconnected = self.start_zenoh(config, &gateways, listeners.grpc_address()).await?;
-        }
+        let session = open_zenoh(config, &gateways).await?;
         self.start_engines(config, prepared, driver, header)?;
         #[cfg(feature = "zenoh")]
-        {
-            let control = self.recorder.as_ref().map(Recorder::control);
-            if let Some(over_zenoh) = &mut *self.connected.lock().await {
-                over_zenoh.serve_recorder(config, control.as_ref()).await?;
-            }
-            if let Some((settings, users)) = unconnected {
-                self.connecting.spawn(router::connect(settings, users, control, self.connected.clone()));
-            }
+        if let Some((settings, session)) = session {
+            self.start_zenoh(config, &gateways, listeners.grpc_address(), settings, session).await?;
         }
         if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
             let (rules, stopped) =
@@ -195,36 +187,31 @@ impl Running {
         self.start_udp(sockets)
     }
 
-    /// Opens the zenoh session and starts what uses it. Returns the settings and the users of a session whose router does
-    /// not answer; such a session is opened later.
+    /// Starts what uses the zenoh session: now, or without a session once a router answers.
     #[cfg(feature = "zenoh")]
     async fn start_zenoh(
         &mut self,
         config: &Config,
         gateways: &Gateways,
         grpc: Option<SocketAddr>,
-    ) -> Result<Option<(zenoh::Config, Users)>, StartError> {
-        let names = config.vehicles.iter().map(|vehicle| &*vehicle.name);
-        let settings = zenoh_session::settings(&config.zenoh, gateways.message_bytes_max(), names)?;
+        settings: zenoh::Config,
+        session: Option<zenoh::Session>,
+    ) -> Result<(), StartError> {
         let queues = self.inputs.iter().map(|input| input.queue.clone()).collect();
         let (vehicles, fleet) = (self.vehicles.clone(), self.fleet.clone());
-        let users = Users { config: config.clone(), vehicles, gateways: gateways.clone(), queues, fleet, grpc };
-        let is_client = config.zenoh.mode == ZenohMode::Client;
-        if is_client {
-            let endpoints = config.zenoh.connect.clone();
-            self.connecting.spawn(router::watch(self.connected.clone(), endpoints, self.vehicles.clone()));
-        }
-        let session = match zenoh_session::open(settings.clone(), &config.zenoh).await {
-            Err(error) if is_client => {
-                tracing::debug!(%error, "no session");
-                return Ok(Some((settings, users)));
-            }
-            session => session?,
+        let recorder = self.recorder.as_ref().map(Recorder::control);
+        let users =
+            Users { config: config.clone(), vehicles, gateways: gateways.clone(), queues, fleet, grpc, recorder };
+        let Some(session) = session else {
+            let (endpoints, connected) = (config.zenoh.connect.clone(), self.connected.clone());
+            self.connecting.spawn(router::watch(connected.clone(), endpoints, self.vehicles.clone()));
+            self.connecting.spawn(router::connect(settings, users, connected));
+            return Ok(());
         };
         let over_zenoh = OverZenoh::start(session, &users).await?;
         self.zenoh = over_zenoh.endpoints().await;
         *self.connected.lock().await = Some(over_zenoh);
-        Ok(None)
+        Ok(())
     }
 
     /// Starts the recorder, if the configuration names a file, and the engines.
@@ -337,6 +324,26 @@ impl Running {
         self.udp = Some(sockets.start(&queues).map_err(StartError::UdpThread)?);
         Ok(())
     }
+}
+
+/// The settings of the zenoh session, and the open session unless it needs a router; `None` without zenoh.
+#[cfg(feature = "zenoh")]
+async fn open_zenoh(
+    config: &Config,
+    gateways: &Gateways,
+) -> Result<Option<(zenoh::Config, Option<zenoh::Session>)>, StartError> {
+    if !config.zenoh.enabled {
+        return Ok(None);
+    }
+    let names = config.vehicles.iter().map(|vehicle| &*vehicle.name);
+    let settings = zenoh_session::settings(&config.zenoh, gateways.message_bytes_max(), names)?;
+    // A key that cannot be read ends the start, also if the session is opened later.
+    signing_key(&config.zenoh.signing_key)?;
+    let session = match config.zenoh.mode {
+        ZenohMode::Client => None,
+        ZenohMode::Peer | ZenohMode::Router => Some(zenoh_session::open(settings.clone(), &config.zenoh).await?),
+    };
+    Ok(Some((settings, session)))
 }
 
 /// Names a listener that hangs or has stopped, and the ends of certificates, in the status of every vehicle, until
