@@ -1,20 +1,16 @@
 //! `clearway upload`: a folder of finished recordings -> a store, confirmed part by part.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use object_store::ObjectStore;
 
 use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print_line, stop_signal};
+use crate::cli::shared::output::{block_on, counted, print_line};
 use clearway_daemon::base::file_advice::advised;
 use clearway_daemon::store::location;
 use clearway_daemon::store::upload::{self, UploadError};
-
-/// Time between two looks into the folder.
-const SCAN_PERIOD: Duration = Duration::from_secs(5);
 
 /// Send the finished recordings of a folder to a store, and confirm each by reading it back.
 ///
@@ -22,7 +18,7 @@ const SCAN_PERIOD: Duration = Duration::from_secs(5);
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway upload recordings --store /mnt/archive
-  clearway upload recordings --store s3://fleet/clearway --follow --delete
+  clearway upload recordings --store s3://fleet/clearway --delete
 
 Exit codes: 0 every part is confirmed, 2 a part is not, 3 wrong use.")]
 pub struct UploadArguments {
@@ -32,9 +28,6 @@ pub struct UploadArguments {
     /// tools.
     #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
     store: String,
-    /// Go on until Ctrl-C: send each further part once it is finished.
-    #[arg(long)]
-    follow: bool,
     /// Delete each part from the folder after the store has confirmed it.
     #[arg(long)]
     delete: bool,
@@ -53,20 +46,8 @@ async fn send(options: &UploadArguments) -> Result<Exit> {
     // A folder that is not there is an error before the store's is made.
     parts(&options.folder)?;
     let store = location::open(&options.store)?;
-    if !options.follow {
-        let unconfirmed = send_all(options, &*store).await?;
-        return Ok(Exit::from_incomplete(unconfirmed > 0));
-    }
-    let follow = async {
-        loop {
-            send_all(options, &*store).await?;
-            tokio::time::sleep(SCAN_PERIOD).await;
-        }
-    };
-    tokio::select! {
-        ended = follow => ended,
-        () = stop_signal()? => Ok(Exit::from_incomplete(!parts(&options.folder)?.is_empty())),
-    }
+    let unconfirmed = send_all(options, &*store).await?;
+    Ok(Exit::from_incomplete(unconfirmed > 0))
 }
 
 fn parts(folder: &Path) -> Result<Vec<PathBuf>> {
