@@ -304,8 +304,9 @@ async fn send_maps(
             }
             is_answered = &mut on_the_way, if !on_the_way.is_terminated() => {
                 if was_answered && !is_answered {
-                    let vehicle = &*served.status.name;
-                    tracing::warn!(vehicle, "zenoh: a map a second is sent: the link is cut, or the router denies the query of clearway/{vehicle}/link");
+                    let key = format!("clearway/{}/link", served.status.name);
+                    let reason = "the link is cut, or the router denies this query";
+                    tracing::warn!(key, reason, "zenoh: a map a second is sent");
                 }
                 was_answered = is_answered;
             }

@@ -9,12 +9,9 @@ use object_store::local::LocalFileSystem;
 use object_store::prefix::PrefixStore;
 use object_store::{ClientOptions, ObjectStore, RetryConfig};
 
-use super::upload_limit::UploadLimit;
+use super::upload_limit::{REQUEST_TIMEOUT, UploadLimit};
 use crate::base::file_advice::advised;
 
-/// Longest time of one request without a limit of uploads. Ours: a piece of a part (5 MiB) arrives in this time at 400
-/// kbit/s.
-pub(super) const REQUEST_TIMEOUT: Duration = Duration::from_secs(105);
 /// Longest time in which a request is repeated. Ours; after it the part waits until the folder is looked at again.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(5);
 
