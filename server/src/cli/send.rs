@@ -38,9 +38,10 @@ pub struct SendArguments {
     /// Speed, as a multiple of the recorded one, such as 0.5; or max for as fast as possible.
     #[arg(long, default_value = "1", value_name = "X|max", value_parser = pace)]
     speed: Pace,
-    /// Simulate a bad network. In percent of the datagrams: loss, duplicate, truncate (cut short), flip (a bit). In data
-    /// packets: burst (most that are lost in a row; about one packet in 200 begins a burst), reorder (most that overtake
-    /// a late one; one in four is late). Also delay_ms (longest delay) and seed (the same seed makes the same network).
+    /// Simulate a bad network. In percent of the datagrams: loss, duplicate, truncate (cut short), flip (a bit). In
+    /// data packets: burst (most that are lost in a row; about one packet in 200 begins a burst), reorder (most that
+    /// overtake a late one; one in four is late). Also delay_ms (longest delay) and seed (the same seed makes the same
+    /// network).
     #[arg(long, value_name = "FAULT=N,...", value_parser = network::faults)]
     network: Option<Faults>,
     /// Print one JSON object at the end.

@@ -1,5 +1,5 @@
-//! A capture, or an MCAP file with VelodyneScan messages -> its datagrams, sent over UDP at the recorded pace, through a
-//! bad network if one is wanted.
+//! A capture, or an MCAP file with VelodyneScan messages -> its datagrams, sent over UDP at the recorded pace, through
+//! a bad network if one is wanted.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;

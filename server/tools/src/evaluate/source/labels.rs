@@ -1,9 +1,9 @@
 //! SemanticKITTI labels -> the truth about a scan's points.
 //!
 //! In: a `.label` file (one u32 a point, the class in the lower 16 bits), the points in the ego frame. Out:
-//! [`JudgedPoint`]s. A point that is not ground is an obstacle if it is 0.3 to 2.5 m above the labelled ground around it.
-//! Ground is drivable if it can be reached from the blind zone over cells without obstacles. The cells are 1 degree wide
-//! and one sensor ring deep; up to two rows without points are bridged.
+//! [`JudgedPoint`]s. A point that is not ground is an obstacle if it is 0.3 to 2.5 m above the labelled ground around
+//! it. Ground is drivable if it can be reached from the blind zone over cells without obstacles. The cells are 1 degree
+//! wide and one sensor ring deep; up to two rows without points are bridged.
 
 use std::collections::BTreeMap;
 use std::path::Path;
