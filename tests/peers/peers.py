@@ -16,7 +16,7 @@ the milliseconds, median of the ratios to Patchwork++ in the same round) and rat
 | linefit | ground points (PyPI linefit) |
 | travel | ground points (PyPI travel-seg) |
 | velodyne-decoder | packets of a simulated revolution of an HDL-64E -> points (PyPI velodyne-decoder) |
-| clearway STAGE | see tests/src/bin/stages.rs; `all` is decode + maps + encode |
+| clearway STAGE | see tests/benches/stages.rs; `all` is decode + maps + encode |
 | clearway LAYER, its share | the layer alone, with a sixth of `shared`, which a map of six layers does once |
 
 The packages are installed into an environment below --venv, which is made at the first run.
@@ -55,15 +55,15 @@ DECODE_TARGET = 5
 
 
 def build():
-    """The built program `stages` and the command `clearway`."""
-    release = ["build", "--release", "--no-default-features", "-p"]
-    stages = environment.build(*release, "clearway-tests", "--bin", "stages")
-    command = environment.build(*release, "clearway", "-F", "tools")
+    """The built bench `stages` and the command `clearway`."""
+    small = ["--no-default-features", "-p"]
+    stages = environment.build("bench", "--no-run", *small, "clearway-tests", "--bench", "stages")
+    command = environment.build("build", "--release", *small, "clearway", "-F", "tools")
     return stages["stages"], command["clearway"]
 
 
 class Clearway:
-    """The program `stages` on one scan."""
+    """The bench `stages` on one scan."""
 
     def __init__(self, bench, scan, height_m):
         command = [bench, scan, "--height", str(height_m), "--ask"]

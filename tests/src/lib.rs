@@ -12,10 +12,6 @@ pub mod packets;
 pub mod simulation;
 
 #[cfg(feature = "siege")]
-pub mod growth;
-#[cfg(feature = "siege")]
-pub mod larger_fleet;
-#[cfg(feature = "siege")]
 pub mod machines;
 #[cfg(feature = "siege")]
 pub mod roles;

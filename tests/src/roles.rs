@@ -1,42 +1,24 @@
-//! The processes of a simulated fleet, as `machines` and `growth` start them: routers, servers, senders and readers.
+//! The processes of a simulated fleet, as `machines` starts them: routers, servers, senders and readers.
 //!
 //! A server is the program `clearway`; every other process is the binary of the run itself with one of the [`Role`]s.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clap::Subcommand;
 use clearway_client::{
     Client, MapStream, MapView, Observation, Staleness, StreamEvent, Subscription, Update, ZenohClient, now_ns,
 };
 use clearway_daemon::config::{Config, Vehicle, ZenohMode};
-use clearway_lidar::model::Model;
 use clearway_proto::v1;
-use clearway_sim::scanner::ScannerConfig;
-use clearway_sim::scenes::town;
-use clearway_sim::vehicle::SimulatedVehicle;
 use prost::Message;
 use rand::{Rng, SeedableRng};
-
-use crate::packets::{packets, send};
 
 /// The environment of a router, as in `deploy/`: a thread that closes the connection of a peer behind a cut link is
 /// blocked for up to 10 s, because zenoh lets the socket linger. With zenoh's two threads that receive, two such peers
 /// stop a router.
 pub const ROUTER_ENVIRONMENT: (&str, &str) = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))");
-
-/// Layers that a planner reads.
-pub const LAYERS: [&str; 2] = ["drivability", "speed"];
-/// Age of a map that arrives late, in ms: the default validity.
-const LATE_MS: f64 = 300.0;
-/// Time between two lines of [`Role::Planners`].
-const REPORT_PERIOD: Duration = Duration::from_millis(200);
-/// Planners that connect at once.
-const CONNECTING_MAX: usize = 8;
 
 /// What a process of the run does.
 ///
@@ -75,26 +57,10 @@ pub enum Role {
         /// Endpoints of the routers to which it connects.
         others: String,
     },
-    /// Planners, each with a session of its own, that read [`LAYERS`]; prints what has come.
-    Planners {
-        /// Endpoint of the router.
-        endpoint: String,
-        /// The name of each planner's vehicle.
-        vehicles: String,
-    },
-    /// Sends the packets of a simulated sensor.
-    Sensors {
-        /// The model, such as `vlp16`.
-        model: String,
-        /// Length of the drive.
-        seconds: u64,
-        /// The UDP address of each vehicle.
-        to: String,
-    },
 }
 
 impl Role {
-    /// Runs the role. It ends with the process, but for [`Role::Sensors`].
+    /// Runs the role. It ends with the process.
     ///
     /// # Panics
     /// If the process cannot do what the role says.
@@ -106,8 +72,6 @@ impl Role {
             Self::Ages { endpoints, vehicles, layer } => runtime.block_on(age(endpoints, vehicles, layer)),
             Self::Read { endpoints, vehicles } => runtime.block_on(read(endpoints, vehicles)),
             Self::Router { listen, others } => runtime.block_on(route(listen, others)),
-            Self::Planners { endpoint, vehicles } => runtime.block_on(plan(endpoint, vehicles)),
-            Self::Sensors { model, seconds, to } => sense(model, Duration::from_secs(*seconds), to),
         }
     }
 }
@@ -298,86 +262,6 @@ async fn route(listen: &str, others: &str) {
     config.insert_json5("connect/endpoints", &format!("{others:?}")).expect("a setting of zenoh");
     let _router = zenoh::open(config).await.expect("the port is free");
     std::future::pending::<()>().await;
-}
-
-/// What planners have received.
-#[derive(Default)]
-struct Received {
-    maps: AtomicU64,
-    bytes: AtomicU64,
-    /// Maps that the links lost.
-    lost: AtomicU64,
-    /// Maps that came older than [`LATE_MS`].
-    late: AtomicU64,
-    connected: AtomicU64,
-}
-
-/// A session and a stream of each layer for each vehicle. Lines: milliseconds since the start, planners with a session,
-/// maps, bytes, lost maps, late maps; all since the start.
-async fn plan(endpoint: &str, vehicles: &str) {
-    let (received, began) = (Arc::<Received>::default(), Instant::now());
-    let turns = Arc::new(tokio::sync::Semaphore::new(CONNECTING_MAX));
-    for vehicle in vehicles.split(',').filter(|name| !name.is_empty()).map(str::to_owned) {
-        let (received, turns, endpoint) = (received.clone(), turns.clone(), endpoint.to_owned());
-        tokio::spawn(async move {
-            let turn = turns.acquire().await.expect("it is not closed");
-            let client = connect(&endpoint).await;
-            let mut streams = Vec::new();
-            for layer in LAYERS {
-                streams.push(client.subscribe(&vehicle, layer).await.expect("a subscription"));
-            }
-            drop(turn);
-            received.connected.fetch_add(1, Ordering::Relaxed);
-            futures::future::join_all(streams.into_iter().map(|maps| count(maps, &received))).await;
-        });
-    }
-    let mut every = tokio::time::interval(REPORT_PERIOD);
-    loop {
-        every.tick().await;
-        let Received { maps, bytes, lost, late, connected } = &*received;
-        let counts = [connected, maps, bytes, lost, late].map(|count| count.load(Ordering::Relaxed));
-        let [connected, maps, bytes, lost, late] = counts;
-        println!("{} {connected} {maps} {bytes} {lost} {late}", began.elapsed().as_millis());
-    }
-}
-
-/// Counts the maps of a stream until it ends.
-async fn count(mut maps: MapStream, received: &Received) {
-    while let Ok(update) = maps.next().await {
-        // Maps between this one and the last were received too, but for the lost ones; their sizes differ little.
-        let maps = 1 + update.skipped - update.lost;
-        received.maps.fetch_add(maps, Ordering::Relaxed);
-        received.bytes.fetch_add(maps * update.map.bytes().len() as u64, Ordering::Relaxed);
-        received.lost.fetch_add(update.lost, Ordering::Relaxed);
-        received.late.fetch_add(u64::from(update.map.age_ms(now_ns()) > LATE_MS), Ordering::Relaxed);
-    }
-}
-
-/// Simulates the drive beforehand, so that only sending takes time while it is measured.
-fn sense(model: &str, length: Duration, to: &str) {
-    let config = ScannerConfig { model: model.parse::<Model>().expect("a model"), ..ScannerConfig::default() };
-    let second = Duration::from_secs(1);
-    let began = Instant::now();
-    packets(SimulatedVehicle::new(town(), config.clone()), second);
-    // The drive's stamps are those of the moment at which it will be sent.
-    let lead = second + began.elapsed().mul_f64(1.5 * length.as_secs_f64());
-    let (start, start_ns) = (Instant::now() + lead, now_ns() + lead.as_nanos() as i64);
-    let drive = packets(SimulatedVehicle::starting_at(town(), config, start_ns), length);
-    let to: Vec<(usize, SocketAddr)> = to.split(',').map(|at| at.parse().expect("an address")).enumerate().collect();
-    send(&drive, &to, to.len(), start, &AtomicU64::default());
-}
-
-/// The last line that a process has printed, empty before the first.
-pub fn last_line(process: &mut Process) -> Arc<Mutex<String>> {
-    let (output, last) = (process.0.stdout.take().expect("piped"), Arc::<Mutex<String>>::default());
-    std::thread::spawn({
-        let last = last.clone();
-        move || {
-            let lines = std::io::BufRead::lines(std::io::BufReader::new(output));
-            lines.map_while(Result::ok).for_each(|line| *last.lock().expect("no panic") = line);
-        }
-    });
-    last
 }
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 //! Measures each stage of a revolution of an HDL-64E on one thread, in turn with a floor: the least work on the same
 //! data that could do it.
 //!
-//!   cargo run --release -p clearway-tests --no-default-features --bin stages             a simulated scan of a town
-//!   cargo run ... --bin stages -- SCAN.bin --height 1.73                                 a scan in KITTI's format
+//!   cargo bench -p clearway-tests --no-default-features --bench stages       a simulated scan of a town
+//!   cargo bench ... --bench stages -- SCAN.bin --height 1.73                 a scan in KITTI's format
 //!
 //! `--ask` is for `tests/peers/peers.py`.
 //!
@@ -68,6 +68,9 @@ struct Arguments {
     /// its nanoseconds.
     #[arg(long)]
     ask: bool,
+    /// Set by cargo bench.
+    #[arg(long, hide = true)]
+    bench: bool,
 }
 
 fn main() {
