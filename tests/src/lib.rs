@@ -1,5 +1,5 @@
 //! What the whole-system tests share: the built command, a way to run it, damaged recordings, the simulation of the
-//! whole system, and attacks on its listeners.
+//! whole system, attacks on its listeners, and locks of tests that run one at a time.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
@@ -7,8 +7,8 @@ use std::sync::OnceLock;
 
 pub mod attack;
 pub mod damage;
-pub mod digests;
 pub mod packets;
+pub mod serial;
 pub mod simulation;
 
 #[cfg(feature = "siege")]

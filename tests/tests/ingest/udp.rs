@@ -330,7 +330,7 @@ async fn two_captures_sent_to_one_port_make_the_maps_of_their_files() {
     assert_eq!(sent, [976, 347]);
     until("all are taken", || [0, 1].map(|vehicle| ledger(&running, vehicle).received) == sent).await;
     within("shutdown", running.shutdown()).await.unwrap();
-    let live = recorded_of(&at("live.mcap"));
+    let live = fixture::recorded_of_all(&at("live.mcap"));
 
     for (vehicle, capture, _) in captures {
         let record = at(&format!("{vehicle}.mcap"));
@@ -355,14 +355,4 @@ async fn two_captures_sent_to_one_port_make_the_maps_of_their_files() {
             assert!(live.layers == file.layers, "{vehicle}, map {sequence}, layer {layer}");
         }
     }
-}
-
-/// The recorded bytes by vehicle, sequence and layer.
-fn recorded_of(file: &Path) -> BTreeMap<(String, u64, String), bytes::Bytes> {
-    let entries = RecordingReader::open(file).unwrap().map(|entry| entry.unwrap());
-    let maps = entries.filter_map(|entry| match entry {
-        RecordedMessage::Map { vehicle, layer, bytes } => Some(((vehicle, fixture::sequence(&bytes), layer), bytes)),
-        _ => None,
-    });
-    maps.collect()
 }

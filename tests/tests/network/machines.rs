@@ -2,16 +2,13 @@
 //! vehicle whose uplink has 1 Mbit/s and 200 kbit/s. Validity and faults are longer than there, so that a machine with
 //! other work to do delays no map into staleness.
 
-use std::sync::{Mutex, PoisonError};
+use clearway_tests::serial::NAMESPACES;
 
 use crate::fixture::venv;
 
-/// The names of the machines are those of the host, so one test at a time has them.
-static MACHINES: Mutex<()> = Mutex::new(());
-
 /// What `machines` prints.
 fn machines(arguments: &[&str]) -> String {
-    let _mine = MACHINES.lock().unwrap_or_else(PoisonError::into_inner);
+    let _namespaces = NAMESPACES.enter();
     let output = clearway_tests::run(&clearway_tests::workspace(), "machines", arguments);
     let shown = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{shown}");

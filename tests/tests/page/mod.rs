@@ -16,9 +16,6 @@ mod space;
 #[cfg(clearway_browser)]
 mod webdriver;
 
-#[cfg(clearway_browser)]
-use std::sync::{Mutex, PoisonError};
-
 macro_rules! in_a_browser {
     ($($name:ident => $test:path),* $(,)?) => { $(
         #[test]
@@ -28,18 +25,12 @@ macro_rules! in_a_browser {
         )]
         fn $name() {
             #[cfg(clearway_browser)]
-            one_at_a_time($test);
+            {
+                let _browser = clearway_tests::serial::BROWSER.enter();
+                $test();
+            }
         }
     )* };
-}
-
-/// Runs a test while no other runs: a browser without a graphics card draws with all processors, and beside a second
-/// one it answers a click after half a minute or never.
-#[cfg(clearway_browser)]
-fn one_at_a_time(test: fn()) {
-    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
-    let _mine = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
-    test();
 }
 
 in_a_browser! {

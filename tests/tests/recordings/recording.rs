@@ -15,7 +15,6 @@ use clearway_journal::verify::DifferenceKind;
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
-use clearway_tests::digests::Digests;
 use prost::Message;
 
 use crate::fixture::copied::copy;
@@ -108,10 +107,6 @@ async fn planted_nondeterminism_is_named_by_sequence_layer_and_cell() {
     let cell = format!("sequence 1, layer drivability: cell row {} column {}, ", changed / columns, changed % columns);
     assert!(report.different == 2 && found[0].contains(&cell), "{found:?}, planted in cell {changed}");
     assert!(found[1].contains("sequence 3, layer terrain: header completed_ns: "), "{found:?}");
-    let [whole, planted] = [whole, planted].map(|file| Digests::of(&file).unwrap());
-    let difference = whole.first_difference(&planted);
-    assert_eq!(difference.as_deref(), Some("vehicle car, sequence 1, layer drivability"));
-    assert!(whole.sum() != planted.sum() && whole.first_difference(&whole.clone()).is_none());
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -3,14 +3,11 @@
 use std::fs;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::sync::{Mutex, PoisonError};
 
+use clearway_tests::serial::DEFAULT_PORTS;
 use clearway_tests::{binaries, run, workspace};
 
 use crate::fixture::venv;
-
-/// The demo and a server with the default configuration use the same ports.
-static DEFAULT_PORTS: Mutex<()> = Mutex::new(());
 
 /// Every command line of the README's `sh` blocks, in order.
 fn commands() -> Vec<String> {
@@ -63,7 +60,7 @@ fn the_first_command_is_the_demo_and_the_second_runs_all_tests() {
 
 #[test]
 fn the_demo_runs_and_ends_cleanly() {
-    let _ports = DEFAULT_PORTS.lock().unwrap_or_else(PoisonError::into_inner);
+    let _ports = DEFAULT_PORTS.enter();
     let folder = tempfile::tempdir().expect("a folder");
     let output = run(folder.path(), "clearway", &["demo", "--seconds", "3"]);
     let said = String::from_utf8_lossy(&output.stdout);
@@ -125,7 +122,7 @@ fn the_evaluate_commands_of_the_readme_succeed() {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_default_configuration_serves_what_send_sends_to_the_readers() {
-    let _ports = DEFAULT_PORTS.lock().unwrap_or_else(PoisonError::into_inner);
+    let _ports = DEFAULT_PORTS.enter();
     let folder = tempfile::tempdir().expect("a folder");
     let capture = Path::new(env!("CLEARWAY_DRIVES")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");

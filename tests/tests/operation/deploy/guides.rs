@@ -6,6 +6,7 @@ use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::Command;
 
+use clearway_tests::serial::PACKAGES;
 use clearway_tests::{binaries, workspace};
 
 use super::{said, venv};
@@ -66,6 +67,7 @@ fn follow(folder: &Path, script: &str) -> String {
 #[test]
 #[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
 fn the_guide_of_the_first_sensor_leads_to_a_map() {
+    let _packages = PACKAGES.enter();
     let folder = tempfile::tempdir().expect("a folder");
     let mut script = SENSOR.to_owned();
     let blocks = blocks("A real Velodyne in ten minutes");
@@ -94,6 +96,7 @@ fn the_guide_of_the_first_sensor_leads_to_a_map() {
 #[test]
 #[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
 fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
+    let _packages = PACKAGES.enter();
     let folder = tempfile::tempdir().expect("a folder");
     let blocks = blocks("A fleet with TLS from nothing");
     let mut script = SENSOR.to_owned();

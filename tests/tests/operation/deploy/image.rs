@@ -6,6 +6,7 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use clearway_tests::serial::PACKAGES;
 use clearway_tests::{binaries, workspace};
 
 use super::{said, succeeds};
@@ -77,6 +78,7 @@ fn get(at: &str, path: &str) -> String {
 #[test]
 #[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
 fn the_image_serves_from_a_read_only_root_without_rights_and_ends_at_sigterm() {
+    let _packages = PACKAGES.enter();
     let folder = tempfile::tempdir().expect("a folder");
     let root = built(&Buildah(folder.path().to_path_buf()));
     let config = folder.path().join("config");

@@ -5,6 +5,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use clearway_tests::serial::PACKAGES;
 use clearway_tests::{run, workspace};
 
 use super::{said, succeeds, unpacked_release, venv};
@@ -133,6 +134,7 @@ fn the_manifests_follow_the_schemas_of_kubernetes_and_their_configuration_is_val
 #[test]
 #[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
 fn systemd_finds_nothing_in_the_units_of_the_release() {
+    let _packages = PACKAGES.enter();
     let folder = tempfile::tempdir().expect("a folder");
     let root = folder.path().join("root");
     unpacked_release(folder.path(), &root);

@@ -18,6 +18,14 @@ use proptest::prelude::*;
 
 use crate::common::*;
 
+/// Cases of each property: a sample; `PROPTEST_CASES=200` runs as many.
+const CASES: u32 = 48;
+
+fn proptest_config() -> ProptestConfig {
+    let is_set = std::env::var_os("PROPTEST_CASES").is_some();
+    if is_set { ProptestConfig::default() } else { ProptestConfig::with_cases(CASES) }
+}
+
 /// Class 0 of every layer.
 const UNKNOWN: u8 = 0;
 
@@ -52,7 +60,7 @@ fn config() -> impl Strategy<Value = DrivabilityConfig> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(200))]
+    #![proptest_config(proptest_config())]
 
     #[test]
     fn over_the_plane_a_cell_is_known_exactly_if_it_contains_a_point(
