@@ -55,7 +55,8 @@ fn the_first_command_is_the_demo_and_the_second_runs_all_tests() {
     assert_eq!(commands[0], "cargo run --release -- demo");
     assert_eq!(commands[1], "cargo test --workspace");
     let ci = fs::read_to_string(workspace().join(".ci/run")).expect(".ci/run");
-    assert_eq!(ci.lines().last(), Some(commands[1].as_str()), ".ci/run ends with the README's test command");
+    let is_run = ci.lines().any(|line| line.split(" | ").next() == Some(&commands[1]));
+    assert!(is_run, ".ci/run runs the README's test command");
 }
 
 #[test]
