@@ -157,7 +157,11 @@ mod tests {
 
     #[test]
     fn a_declared_sensor_is_chosen_only_while_no_configured_one_has_a_scan() {
-        let seen = |sectors| SensorScan { completed: 1, ..scan(0.0, sectors) };
+        let seen = |sectors| {
+            let mut scan = scan(0.0, sectors);
+            scan.completed = 1;
+            scan
+        };
         let at = |event_ns| EventTime { event_ns, ..EventTime::default() };
         let mut choice = ReferenceChoice::new(false, 2, 100);
         // Two configured sensors, and a declared one that sees more.
