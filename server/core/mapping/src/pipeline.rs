@@ -114,7 +114,7 @@ impl Pipeline {
                 config.sensors.len(),
                 config.fusion.deadline_ns(),
             ),
-            maps: config.maps.clone(),
+            maps: config.maps.with_one_overhang(),
             deadline_ns: config.fusion.deadline_ns(),
             has_epochs: config.time.ahead_ms_max > 0,
             clock: EventClock::default(),

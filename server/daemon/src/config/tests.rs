@@ -191,7 +191,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         (
             "[[vehicle]]",
             "[recorder]\nfile = \"a\"\nwarm_up_ms = 500\n[vehicle_defaults.maps.memory]\nenabled = true\n[[vehicle]]",
-            "ground_s_max = 5 s",
+            "at least the 5 s",
         ),
     ];
     for (from, to, allowed) in wrong {

@@ -6,6 +6,7 @@ use clearway_journal::RecordedVehicle;
 use clearway_journal::reader::{RecordingError, RecordingReader};
 use clearway_journal::verify::{Report, VerifyError};
 use clearway_mapping::config::TimeConfig;
+use tracing::warn;
 
 use crate::config::{Calibrations, Config};
 
@@ -16,7 +17,11 @@ use crate::config::{Calibrations, Config};
 /// [`RecordingError::Calibration`] if a table that it names is missing or invalid.
 pub fn run_config(recording: &RecordingReader) -> Result<(Config, Calibrations), RecordingError> {
     let text = recording.config_text()?;
-    let mut config = Config::parse(text, &recording.file().join("config.toml"), &[])
+    let (known, changed) = without_removed_keys(text);
+    for key in changed {
+        warn!("{}: {key}: its maps may differ", recording.file().display());
+    }
+    let mut config = Config::parse(&known, &recording.file().join("config.toml"), &[])
         .map_err(|error| RecordingError::Config(error.into()))?;
     use_rules_of_the_run(&mut config, text);
     let tables = config
@@ -43,6 +48,103 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     clearway_journal::verify::verify(recording, recorded_vehicles(&config, tables))
 }
 
+/// Keys of `[vehicle.maps]` that earlier versions had and that are constants now: table, key, value.
+const CONSTANTS: [(&str, &str, &str); 54] = [
+    ("speed", "step_m_max", "0.2"),
+    ("speed", "grade_max", "0.2"),
+    ("speed", "smooth_m", "0.03"),
+    ("speed", "rough_m", "0.15"),
+    ("speed", "roughness_smooth", "0.002"),
+    ("speed", "roughness_rough", "0.01"),
+    ("speed", "rough_share", "0.5"),
+    ("speed", "bonus_reach_m", "4"),
+    ("speed", "road_age_ms_max", "500"),
+    ("speed", "divergence_min", "0.1"),
+    ("speed", "route_ahead_m", "30"),
+    ("speed", "curvature_per_m_max", "0.05"),
+    ("speed", "overhang_m", "2.5"),
+    ("speed", "corridor", "true"),
+    ("speed", "speed_limits", "true"),
+    ("occupancy", "clear_height_m_min", "0.2"),
+    ("occupancy", "clear_height_m_max", "0.5"),
+    ("occupancy", "speed_mps_slow", "4.4"),
+    ("occupancy", "speed_mps_fast", "26.8"),
+    ("occupancy", "hits_slow", "20"),
+    ("occupancy", "hits_fast", "2"),
+    ("occupancy", "hold_maps", "2"),
+    ("occupancy", "calm_maps", "5"),
+    ("occupancy", "hits", "reduced"),
+    ("drivability", "overhang_m", "2.5"),
+    ("drivability", "unit_height_m", "0.25"),
+    ("drivability", "offset_m", "0.125"),
+    ("drivability", "seed", "blind_zone"),
+    ("drivability", "blind_zone_m", "7"),
+    ("drivability", "bridge_rows", "2"),
+    ("drivability", "close_gaps", "true"),
+    ("drivability", "step_m_max", "0.15"),
+    ("drivability", "grade_max", "0.2"),
+    ("drivability", "plane_error_m_max", "0.25"),
+    ("drivability", "plane_test", "each_side"),
+    ("drivability", "passage", "to_drivable_ground"),
+    ("terrain", "overhang_m", "2.5"),
+    ("terrain", "flatness_m2_max", "0.005"),
+    ("terrain", "points_min", "3"),
+    ("terrain", "residual_m_max", "0.15"),
+    ("terrain", "grade_max", "0.2"),
+    ("terrain", "step_m_max", "0.25"),
+    ("terrain", "inference_m_max", "3"),
+    ("terrain", "noise_m", "0.02"),
+    ("terrain", "roughness_points_min", "4"),
+    ("safe_path", "blind_zone_m", "7"),
+    ("safe_path", "hole_m_max", "1"),
+    ("safe_path", "join_m_max", "15"),
+    ("memory", "range_m_max", "25"),
+    ("memory", "ground_s_max", "5"),
+    ("memory", "obstacle_s_max", "0.3"),
+    ("motion", "extrapolation_ms", "200"),
+    ("motion", "speed_age_ms", "2000"),
+    ("reach", "step_slope_min", "0.5"),
+];
+
+/// Keys of other tables that earlier versions had. They changed no map.
+const REMOVED: [(&str, &str); 0] = [];
+
+/// The text of a recorded configuration without the keys that this version does not have, and a sentence for each of
+/// them whose recorded value is not the constant of this version.
+fn without_removed_keys(text: &str) -> (String, Vec<String>) {
+    let Ok(mut document) = text.parse::<toml::Table>() else { return (text.to_owned(), Vec::new()) };
+    for (table, key) in REMOVED {
+        let mut tables = table.split('.');
+        let first = tables.next().and_then(|name| document.get_mut(name));
+        let found = tables.fold(first, |value, name| value.and_then(|value| value.get_mut(name)));
+        if let Some(table) = found.and_then(toml::Value::as_table_mut) {
+            table.remove(key);
+        }
+    }
+    let mut changed = Vec::new();
+    let vehicles = document.get_mut("vehicle").and_then(toml::Value::as_array_mut).into_iter().flatten();
+    for maps in vehicles.filter_map(|vehicle| vehicle.get_mut("maps")) {
+        for (table, key, constant) in CONSTANTS {
+            let keys = maps.get_mut(table).and_then(toml::Value::as_table_mut);
+            let Some(recorded) = keys.and_then(|keys| keys.remove(key)) else { continue };
+            if !is_same_value(&recorded, constant) {
+                changed.push(format!("vehicle.maps.{table}.{key} = {recorded} is the constant {constant} now"));
+            }
+        }
+    }
+    (document.to_string(), changed)
+}
+
+/// True if a recorded value is a constant: numbers are compared as 32-bit ones, as the layers have them.
+fn is_same_value(recorded: &toml::Value, constant: &str) -> bool {
+    match recorded {
+        toml::Value::Integer(number) => constant.parse() == Ok(*number as f32),
+        toml::Value::Float(number) => constant.parse() == Ok(*number as f32),
+        toml::Value::String(text) => text == constant,
+        other => other.to_string() == constant,
+    }
+}
+
 /// Sets the rules of a run that was recorded before they could be configured. A recorded configuration is complete, so
 /// a table that it lacks is one that its program did not have.
 fn use_rules_of_the_run(config: &mut Config, text: &str) {
@@ -58,6 +160,17 @@ fn use_rules_of_the_run(config: &mut Config, text: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_removed_key_is_read_and_named_if_its_value_is_not_the_constant() {
+        let mut document: toml::Table = Config::of_one_vehicle("car", "top").to_toml().parse().unwrap();
+        let speed = document["vehicle"][0]["maps"]["speed"].as_table_mut().unwrap();
+        speed.insert("smooth_m".into(), 0.03.into());
+        speed.insert("rough_m".into(), 0.25.into());
+        let (text, changed) = without_removed_keys(&document.to_string());
+        assert_eq!(changed, ["vehicle.maps.speed.rough_m = 0.25 is the constant 0.15 now"]);
+        Config::parse(&text, Path::new("config.toml"), &[]).unwrap();
+    }
 
     #[test]
     fn a_recording_of_a_program_without_epochs_is_replayed_without_epochs() {

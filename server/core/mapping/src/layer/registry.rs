@@ -72,14 +72,21 @@ macro_rules! layers {
                 maps
             }
 
+            /// The configuration in which the layers take the overhang of `reach`.
+            pub(crate) fn with_one_overhang(&self) -> Self {
+                let mut maps = self.clone();
+                maps.drivability.overhang_m = self.reach.overhang_m;
+                maps.terrain.overhang_m = self.reach.overhang_m;
+                maps.speed.overhang_m = self.reach.overhang_m;
+                maps
+            }
+
             /// Checks all values of all layers, enabled or not.
             ///
             /// # Errors
             /// [`ConfigValueError`] for the first value that is not allowed.
             pub fn validate(&self) -> Result<(), ConfigValueError> {
                 check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
-                self.motion.validate("vehicle.maps.motion")?;
-                self.memory.validate("vehicle.maps.memory")?;
                 self.reach.validate("vehicle.maps.reach")?;
                 $(self.$name.validate(concat!("vehicle.maps.", stringify!($name)))?;)+
                 Ok(())

@@ -15,7 +15,7 @@ use nalgebra::{Isometry3, Point3};
 
 use crate::sensor::sweep::Sweep;
 
-use config::MemoryConfig;
+use config::{GROUND_S_MAX, MemoryConfig, OBSTACLE_S_MAX, RANGE_M_MAX};
 
 /// Side of a cell, metres. Ours: the cells of the reach stage.
 const CELL_M: f64 = 0.25;
@@ -49,7 +49,6 @@ struct Cell {
 /// The memory of one vehicle.
 #[derive(Clone)]
 pub(crate) struct Memory {
-    config: MemoryConfig,
     cells: Vec<Cell>,
     /// Indices of the cells that hold something.
     listed: Vec<u32>,
@@ -74,7 +73,6 @@ impl Memory {
     /// An empty memory; `None` if the configuration disables it.
     pub fn new(config: &MemoryConfig) -> Option<Self> {
         config.enabled.then(|| Self {
-            config: config.clone(),
             cells: vec![Cell::default(); (SIDE * SIDE) as usize],
             listed: Vec::new(),
             newest: None,
@@ -112,7 +110,7 @@ impl Memory {
     pub fn remember(&mut self, own_points: usize, heights_m: &[f32]) {
         let Some((pose, stamp_ns)) = self.newest else { return };
         let sweep = std::mem::take(&mut self.extended);
-        let range_squared = self.config.range_m_max * self.config.range_m_max;
+        let range_squared = RANGE_M_MAX * RANGE_M_MAX;
         let points = sweep.x.iter().zip(&sweep.y).zip(&sweep.z).zip(heights_m).take(own_points);
         for (((&x, &y), &z), &height) in points {
             let (is_ground, is_obstacle) = (height.abs() <= GROUND_M_MAX, OBSTACLE_M.contains(&height));
@@ -147,8 +145,8 @@ impl Memory {
 
     /// Removes what is too old, and the ground of cells with a newer obstacle.
     fn expire(&mut self, stamp_ns: i64) {
-        let [ground_ns, obstacle_ns] = [self.config.ground_s_max, self.config.obstacle_s_max]
-            .map(|seconds| (f64::from(seconds) * NS_PER_S) as i64);
+        let [ground_ns, obstacle_ns] =
+            [GROUND_S_MAX, OBSTACLE_S_MAX].map(|seconds| (f64::from(seconds) * NS_PER_S) as i64);
         let cells = &mut self.cells;
         self.listed.retain(|index| {
             let cell = &mut cells[*index as usize];
@@ -179,7 +177,7 @@ impl Memory {
             let [x, y] = cell.world.map(|world| (world as f64 + 0.5) * CELL_M);
             let z = if cell.obstacle_ns != 0 { cell.obstacle_m } else { cell.ground_m };
             let point = (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
-            if point.x * point.x + point.y * point.y <= self.config.range_m_max * self.config.range_m_max {
+            if point.x * point.x + point.y * point.y <= RANGE_M_MAX * RANGE_M_MAX {
                 self.extended.push_remembered([point.x, point.y, point.z]);
             }
         }
@@ -188,7 +186,7 @@ impl Memory {
     /// One bit for each stored cell, set if the map has a point there.
     fn seen_cells(&self, map_from_ego: &Isometry3<f64>) -> Vec<u64> {
         let mut seen = vec![0_u64; (SIDE * SIDE / 64) as usize];
-        let range_squared = self.config.range_m_max * self.config.range_m_max;
+        let range_squared = RANGE_M_MAX * RANGE_M_MAX;
         let sweep = &self.extended;
         for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
             if x * x + y * y <= range_squared {
@@ -259,15 +257,14 @@ mod tests {
 
     #[test]
     fn where_an_obstacle_stood_only_ground_seen_later_is_recalled() {
-        let config = MemoryConfig::default();
-        let forgotten_s = 0.2 + f64::from(config.obstacle_s_max);
+        let forgotten_s = 0.2 + f64::from(OBSTACLE_S_MAX);
         for (heights_m, expected) in [([0.0, 1.0], 0), ([1.0, 0.0], 1600)] {
             let mut memory = memory();
             map(&mut memory, &points(heights_m[0]), 0.0);
             map(&mut memory, &points(heights_m[1]), 0.1);
             assert_eq!(map(&mut memory, &Sweep::default(), 0.2), 1600, "{heights_m:?}");
             assert_eq!(map(&mut memory, &Sweep::default(), forgotten_s), expected, "{heights_m:?}");
-            assert_eq!(map(&mut memory, &Sweep::default(), f64::from(config.ground_s_max) + 0.2), 0, "{heights_m:?}");
+            assert_eq!(map(&mut memory, &Sweep::default(), f64::from(GROUND_S_MAX) + 0.2), 0, "{heights_m:?}");
         }
     }
 }

@@ -4,7 +4,7 @@
 //! high and too steep for the vehicle. Two cells at most two cells apart are compared, so that a grade is no step.
 
 use super::cells::{CELL_M, SIDE};
-use super::config::ReachConfig;
+use super::config::{ReachConfig, STEP_SLOPE_MIN};
 use super::flood::Bits;
 
 /// Lowest height over the ground of a return that is used, metres. Ours: lower ones are mirror images.
@@ -52,7 +52,7 @@ impl Steps {
         let least_mm = (config.step_m_max * 1000.0) as i32;
         let reaches = NEAR.map(|[dx, dy]| {
             let distance_m = CELL_M * ((dx * dx + dy * dy) as f32).sqrt();
-            (dy * SIDE as isize + dx, least_mm.max((config.step_slope_min * distance_m * 1000.0) as i32))
+            (dy * SIDE as isize + dx, least_mm.max((STEP_SLOPE_MIN * distance_m * 1000.0) as i32))
         });
         self.seen.each(|ix, iy| {
             // The outermost cells are compared with fewer others.
@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn a_step_is_as_high_as_configured_and_as_steep_as_configured_in_every_direction() {
-        let config = ReachConfig { step_m_max: 0.2, step_slope_min: 0.5, ..ReachConfig::default() };
+        let config = ReachConfig { step_m_max: 0.2, ..ReachConfig::default() };
         for [dx, dy] in NEAR.into_iter().flat_map(|[dx, dy]| [[dx, dy], [-dx, -dy]]) {
             let apart = [dx, dy].map(|cells| CELL_M * cells as f32);
             let least_m = 0.2_f32.max(0.5 * libm::hypotf(apart[0], apart[1]));

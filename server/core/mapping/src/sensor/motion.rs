@@ -22,7 +22,6 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::sensor::observation::{EgoPose, Scan};
-use crate::value_check::{ConfigValueError, check};
 
 /// Number of poses that are kept. Ours: a second at 1 kHz, which is longer than a revolution of any sensor.
 const POSES_MAX: usize = 1024;
@@ -42,35 +41,25 @@ const JUMP_M_MAX: f64 = 0.5;
 /// of 1 rad/s the error within the millisecond of 16 firings is less than a tenth of a millimetre at 100 m.
 pub(crate) const KNOT_FIRINGS: usize = 16;
 
+/// Time for which the motion is extrapolated after the newest pose (and before the oldest), milliseconds. 200 is
+/// ours: two revolutions at 10 Hz.
+pub(super) const EXTRAPOLATION_MS: u32 = 200;
+
+/// Largest age of a speed that is used if no poses are near enough, milliseconds; 0 leaves such scans
+/// uncompensated. 2000 is ours: two sentences of a GPS receiver that sends one each second.
+pub(super) const SPEED_AGE_MS: u32 = 2000;
+
 /// Parameters of the motion compensation, the table `[vehicle.maps.motion]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MotionConfig {
     /// True if points are moved to the end of their scan. The pose in a map's header is interpolated in any case.
     pub enabled: bool,
-    /// Time for which the motion is extrapolated after the newest pose (and before the oldest), milliseconds. 200 is
-    /// ours: two revolutions at 10 Hz.
-    pub extrapolation_ms: u32,
-    /// Largest age of a speed that is used if no poses are near enough, milliseconds; 0 leaves such scans
-    /// uncompensated. 2000 is ours: two sentences of a GPS receiver that sends one each second.
-    pub speed_age_ms: u32,
 }
 
 impl Default for MotionConfig {
     fn default() -> Self {
-        Self { enabled: true, extrapolation_ms: 200, speed_age_ms: 2000 }
-    }
-}
-
-impl MotionConfig {
-    /// Checks the values of the table `at`.
-    ///
-    /// # Errors
-    /// [`ConfigValueError`] for the first value that is not allowed.
-    pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
-        let extrapolation = f64::from(self.extrapolation_ms);
-        check(extrapolation, 0.0..=1000.0, || format!("{at}.extrapolation_ms"), "0 to 1000")?;
-        check(f64::from(self.speed_age_ms), 0.0..=10_000.0, || format!("{at}.speed_age_ms"), "0 to 10000")
+        Self { enabled: true }
     }
 }
 
@@ -181,7 +170,7 @@ impl Motion {
     /// Ego frame in the world frame at a stamp; `None` if no pose is near enough.
     pub fn map_from_ego(&self, stamp_ns: i64) -> Option<Isometry3<f64>> {
         let next = self.poses.partition_point(|pose| pose.stamp_ns < stamp_ns);
-        let reach_ns = i64::from(self.config.extrapolation_ms) * 1_000_000;
+        let reach_ns = i64::from(EXTRAPOLATION_MS) * 1_000_000;
         let (first, last) = (self.poses.front()?, self.poses.back()?);
         if stamp_ns < first.stamp_ns {
             let is_near = first.stamp_ns.saturating_sub(stamp_ns) <= reach_ns;
@@ -234,7 +223,7 @@ impl Motion {
         let pose = self.poses.back().map(|pose| (stamp_ns.saturating_sub(pose.stamp_ns), pose.speed_mps));
         let age_ns = |measured: SpeedMeasurement| stamp_ns.saturating_sub(measured.stamp_ns.unwrap_or(stamp_ns));
         let measured = self.measured.map(|measured| (age_ns(measured), measured.speed_mps));
-        let age_ns_max = i64::from(self.config.speed_age_ms) * 1_000_000;
+        let age_ns_max = i64::from(SPEED_AGE_MS) * 1_000_000;
         let fresh = [pose, measured].into_iter().flatten().filter(|(age_ns, _)| age_ns.saturating_abs() <= age_ns_max);
         fresh.min_by_key(|(age_ns, _)| age_ns.saturating_abs()).map(|(_, speed_mps)| speed_mps)
     }

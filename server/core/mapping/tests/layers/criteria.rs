@@ -274,7 +274,7 @@ fn a_ring_that_changes_its_row_is_one_piece_of_ground() {
     // The only returns: a ring in the last row where segments start, which goes on in the next row.
     let last = benches(&map(&DrivabilityConfig::default(), &painted(|_, _, _, _| Some(0.0))))
         .iter()
-        .position(|radius_m| *radius_m >= DrivabilityConfig::default().blind_zone_m)
+        .position(|radius_m| *radius_m >= 7.0)
         .unwrap();
     for (from, to) in [(100..140, 140..180), (100..140, 60..100)] {
         let ring = painted(|row, column, _, _| {

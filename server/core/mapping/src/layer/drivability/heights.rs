@@ -8,7 +8,7 @@ use crate::layer::radial_points::RadialPoints;
 use crate::sensor::sweep::Sweep;
 
 use super::class::UNIT_HEIGHT_UNKNOWN;
-use super::config::DrivabilityConfig;
+use super::config::{DrivabilityConfig, UNIT_HEIGHT_M};
 
 /// Highest point of a cell so far: its height over the ground and its index in the sweep.
 #[derive(Clone, Copy, Debug)]
@@ -91,6 +91,6 @@ fn adjust_height(cell: &mut Highest, height: f32, point: usize, sweep: &Sweep) {
 
 /// Height in whole units, clamped to the range of the channel.
 pub fn unit_height(height_m: f32, config: &DrivabilityConfig) -> i8 {
-    let units = ((height_m + config.offset_m) / config.unit_height_m).floor();
+    let units = ((height_m + config.offset_m) / UNIT_HEIGHT_M).floor();
     units.clamp(f32::from(UNIT_HEIGHT_UNKNOWN + 1), f32::from(i8::MAX)) as i8
 }

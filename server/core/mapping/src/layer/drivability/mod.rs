@@ -28,7 +28,7 @@ use crate::layer::radial_points::{RadialPoints, RadialSize};
 use crate::sensor::sweep::Sweep;
 
 use class::{DrivabilityClass, SEGMENT, UNIT_HEIGHT_UNKNOWN};
-use config::{DrivabilityConfig, DrivabilityVariant};
+use config::{DrivabilityConfig, DrivabilityVariant, UNIT_HEIGHT_M};
 use heights::Heights;
 use planes::Planes;
 use search::Search;
@@ -89,7 +89,7 @@ impl Drivability {
         }
         let [x, y, height_m] = self.heights.points()[cell];
         let is_obstacle = match context.ground {
-            Some(_) => height_m > self.config.unit_height_m,
+            Some(_) => height_m > UNIT_HEIGHT_M,
             None => segment == self.segments.unreachable(),
         };
         let is_joined = segment != self.segments.unreachable() && self.search.drivable()[usize::from(segment)];
@@ -102,7 +102,7 @@ impl Drivability {
 
     /// Channel for the height of a cell's highest point, in units of the configured height.
     fn unit_height(&self) -> TypedChannel<i8> {
-        let scale = self.config.unit_height_m;
+        let scale = UNIT_HEIGHT_M;
         TypedChannel { name: "unit_height", unit: "m", scale, unknown: UNIT_HEIGHT_UNKNOWN }
     }
 }

@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use crate::layer::radial_grid::RadialGrid;
 
 use super::class::{SEGMENT, UNIT_HEIGHT_UNKNOWN};
-use super::config::{DrivabilityConfig, Seed};
+use super::config::{BLIND_ZONE_M, DrivabilityConfig, Seed};
 use super::heights::{Heights, unit_height};
 
 /// Mark of a cell with points that belongs to no segment yet.
@@ -126,7 +126,7 @@ fn find_seeds(grid: &RadialGrid, units: &[i8], config: &DrivabilityConfig, seeds
     match config.seed {
         Seed::FirstCell => seeds.extend((0..units.len().min(1)).filter(known).map(|cell| cell as u32)),
         Seed::BlindZone => {
-            let rows = (0..grid.rows()).take_while(|row| grid.row_span_m(*row).0 < config.blind_zone_m).count();
+            let rows = (0..grid.rows()).take_while(|row| grid.row_span_m(*row).0 < BLIND_ZONE_M).count();
             let innermost = |column| (0..rows).map(|row| row * grid.columns() + column).find(known);
             seeds.extend((0..grid.columns()).filter_map(innermost).filter(level).map(|cell| cell as u32));
         }

@@ -4,7 +4,36 @@ use serde::{Deserialize, Serialize};
 
 use crate::value_check::{ConfigValueError, check_cells, check_each, check_fits};
 
-use super::flicker::MAPS_MAX;
+/// Least height at which a ray proves a cell clear, metres: a lower ray could pass under a car. 0.2 is ours; not
+/// tuned.
+pub(super) const CLEAR_HEIGHT_M_MIN: f32 = 0.2;
+
+/// Largest height at which a ray proves a cell clear, metres: a higher ray misses low obstacles. 0.5 is ours, the
+/// height of a bumper; not tuned.
+pub(super) const CLEAR_HEIGHT_M_MAX: f32 = 0.5;
+
+/// Speed up to which `hits_slow` returns make a cell occupied, m/s. 4.4 (10 mph): Seo 2014, figure 5.
+pub(super) const SPEED_MPS_SLOW: f32 = 4.4;
+
+/// Speed from which `hits_fast` returns do, m/s; the number is linear between the two speeds. 26.8 (60 mph): Seo
+/// 2014, figure 5.
+pub(super) const SPEED_MPS_FAST: f32 = 26.8;
+
+/// Number of returns at low speed. 20: Seo 2014, figure 5.
+pub(super) const HITS_SLOW: u8 = 20;
+
+/// Number of returns at high speed, and if the speed is not known. 2: Seo 2014, figure 5.
+pub(super) const HITS_FAST: u8 = 2;
+
+/// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
+/// that no sensor sees again leaves the third map; not tuned.
+pub(super) const HOLD_MAPS: u8 = 2;
+
+/// With `variant = "polar"` and ego poses: number of maps in which a cell that was clear, and then was neither
+/// clear nor occupied, does not become clear again; and a hidden cell becomes clear only in the second map in a row
+/// that shows it clear. 0: both do at once. 5 is ours: of the changes along the borders of shadows half are undone
+/// within five maps; not tuned.
+pub(super) const CALM_MAPS: u8 = 5;
 
 /// Parameters of the layer `occupancy`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,36 +54,14 @@ pub struct OccupancyConfig {
     pub clearance_m: f32,
     /// Least height of a return that is not counted, metres; the vehicle passes under it. 5: Seo 2014, section 2.
     pub overhang_m: f32,
-    /// Least height at which a ray proves a cell clear, metres: a lower ray could pass under a car. 0.2 is ours; not
-    /// tuned.
-    pub clear_height_m_min: f32,
-    /// Largest height at which a ray proves a cell clear, metres: a higher ray misses low obstacles. 0.5 is ours, the
-    /// height of a bumper; not tuned.
-    pub clear_height_m_max: f32,
     /// Reliable range of the sensors, metres; cells beyond it are out of range. 150: Seo 2014, section 2.
     pub range_m_max: f32,
     /// Range to which a ray without a return clears cells, metres; 0: such rays prove nothing. 0 is ours, because a
     /// ray may also be lost on a dark or wet surface.
     pub no_return_m: f32,
-    /// Speed up to which `hits_slow` returns make a cell occupied, m/s. 4.4 (10 mph): Seo 2014, figure 5.
-    pub speed_mps_slow: f32,
-    /// Speed from which `hits_fast` returns do, m/s; the number is linear between the two speeds. 26.8 (60 mph): Seo
-    /// 2014, figure 5.
-    pub speed_mps_fast: f32,
-    /// Number of returns at low speed. 20: Seo 2014, figure 5.
-    pub hits_slow: u8,
-    /// Number of returns at high speed, and if the speed is not known. 2: Seo 2014, figure 5.
-    pub hits_fast: u8,
-    /// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
-    /// that no sensor sees again leaves the third map; not tuned.
-    pub hold_maps: u8,
-    /// With `variant = "polar"` and ego poses: number of maps in which a cell that was clear, and then was neither
-    /// clear nor occupied, does not become clear again; and a hidden cell becomes clear only in the second map in a row
-    /// that shows it clear. 0: both do at once. 5 is ours: of the changes along the borders of shadows half are undone
-    /// within five maps; not tuned.
-    pub calm_maps: u8,
     /// What the channel `hits` contains. `reduced` is ours, because it costs fewer bytes (BENCHMARKS.md has the sizes);
     /// `counted` is the paper's (section 2).
+    #[serde(skip)]
     pub hits: Hits,
 }
 
@@ -87,16 +94,8 @@ impl Default for OccupancyConfig {
             cell_m: 0.25,
             clearance_m: 0.3,
             overhang_m: 5.0,
-            clear_height_m_min: 0.2,
-            clear_height_m_max: 0.5,
             range_m_max: 150.0,
             no_return_m: 0.0,
-            speed_mps_slow: 4.4,
-            speed_mps_fast: 26.8,
-            hits_slow: 20,
-            hits_fast: 2,
-            hold_maps: 2,
-            calm_maps: 5,
             hits: Hits::Reduced,
         }
     }
@@ -113,26 +112,12 @@ impl OccupancyConfig {
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
             ("clearance_m", self.clearance_m, (0.05..=2.0, "0.05 to 2")),
             ("overhang_m", self.overhang_m, (0.5..=20.0, "0.5 to 20")),
-            ("clear_height_m_min", self.clear_height_m_min, (-1.0..=2.0, "-1 to 2")),
-            ("clear_height_m_max", self.clear_height_m_max, (0.05..=5.0, "0.05 to 5")),
             ("range_m_max", self.range_m_max, (5.0..=300.0, "5 to 300")),
             ("no_return_m", self.no_return_m, (0.0..=300.0, "0 to 300")),
-            ("speed_mps_slow", self.speed_mps_slow, (0.0..=100.0, "0 to 100")),
-            ("speed_mps_fast", self.speed_mps_fast, (0.1..=100.0, "0.1 to 100")),
             // If no return were needed, a cell could be occupied without one.
-            ("hits_slow", self.hits_slow.into(), (1.0..=255.0, "1 to 255")),
-            ("hits_fast", self.hits_fast.into(), (1.0..=255.0, "1 to 255")),
-            ("hold_maps", self.hold_maps.into(), (0.0..=100.0, "0 to 100")),
-            ("calm_maps", self.calm_maps.into(), (0.0..=f64::from(MAPS_MAX), "0 to 7")),
         ];
         check_each(at, values)?;
         check_fits(at, "overhang_m", self.overhang_m, self.overhang_m > self.clearance_m, "more than clearance_m")?;
-        let band = self.clear_height_m_max > self.clear_height_m_min;
-        check_fits(at, "clear_height_m_max", self.clear_height_m_max, band, "more than clear_height_m_min")?;
-        let lower = self.clear_height_m_min < self.clearance_m;
-        check_fits(at, "clear_height_m_min", self.clear_height_m_min, lower, "less than clearance_m")?;
-        let faster = self.speed_mps_fast > self.speed_mps_slow;
-        check_fits(at, "speed_mps_fast", self.speed_mps_fast, faster, "more than speed_mps_slow")?;
         check_cells(at, self.extent_m, self.cell_m)
     }
 }

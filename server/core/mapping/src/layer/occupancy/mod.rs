@@ -49,7 +49,9 @@ use crate::sensor::rays::{Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
 use class::{HITS, OccupancyClass};
-use config::{OccupancyConfig, OccupancyVariant};
+use config::{
+    CALM_MAPS, HITS_FAST, HITS_SLOW, HOLD_MAPS, OccupancyConfig, OccupancyVariant, SPEED_MPS_FAST, SPEED_MPS_SLOW,
+};
 use flicker::Flicker;
 use lines::Lines;
 use polar_scan::PolarScans;
@@ -104,17 +106,17 @@ impl Occupancy {
                 }
                 OccupancyVariant::Paper => Scans::Paper(Lines::default()),
             },
-            flicker: Flicker::new(side, config.calm_maps),
+            flicker: Flicker::new(side, CALM_MAPS),
             speed_mps: None,
         }
     }
 
-    /// Number of returns that make a cell occupied at a speed (Seo 2014, figure 5): linear between the two configured
+    /// Number of returns that make a cell occupied at a speed (Seo 2014, figure 5): linear between the two
     /// speeds, constant beyond them.
-    pub fn hits_needed(config: &OccupancyConfig, speed_mps: Option<f64>) -> u8 {
-        let (slow, fast) = (f64::from(config.speed_mps_slow), f64::from(config.speed_mps_fast));
+    pub fn hits_needed(speed_mps: Option<f64>) -> u8 {
+        let (slow, fast) = (f64::from(SPEED_MPS_SLOW), f64::from(SPEED_MPS_FAST));
         let share = speed_mps.map_or(1.0, |speed| ((speed.abs() - slow) / (fast - slow)).clamp(0.0, 1.0));
-        let (at_slow, at_fast) = (f64::from(config.hits_slow), f64::from(config.hits_fast));
+        let (at_slow, at_fast) = (f64::from(HITS_SLOW), f64::from(HITS_FAST));
         (at_slow + share * (at_fast - at_slow)).ceil() as u8
     }
 
@@ -134,7 +136,7 @@ impl Occupancy {
 
     /// Writes the layer from the scans since the last map and since `earliest_ns`, for the window's position.
     fn write(&mut self, earliest_ns: i64, layer: &mut Layer) {
-        let needed = Self::hits_needed(&self.config, self.speed_mps);
+        let needed = Self::hits_needed(self.speed_mps);
         layer.clear_lists();
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
         let mut hits = HITS.reuse(&mut layer.channels);
@@ -145,7 +147,7 @@ impl Occupancy {
             Scans::Polar(scans) => scans.write_evidence(&self.config, earliest_ns, &self.window, &mut class),
             Scans::Paper(lines) => lines.write_evidence(earliest_ns, &self.window, &mut class),
         };
-        let limits = [needed, self.config.hold_maps];
+        let limits = [needed, HOLD_MAPS];
         self.window.update_states(limits, any, self.config.hits, &mut class, &mut hits);
         if self.window.anchored() && self.config.variant == OccupancyVariant::Polar {
             self.flicker.calm(self.window.corner(), &mut class);

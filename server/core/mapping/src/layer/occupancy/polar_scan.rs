@@ -26,7 +26,7 @@ use crate::sensor::rays::Rays;
 
 use super::azimuth_bins::{AzimuthBins, BINS, around, neighbour};
 use super::bits::{any_bit, bits_of_word, set_bits};
-use super::config::OccupancyConfig;
+use super::config::{CLEAR_HEIGHT_M_MAX, CLEAR_HEIGHT_M_MIN, OccupancyConfig};
 use super::ray::Ray;
 use super::states::{HIDDEN, LOOKED_AT, THROUGH};
 use super::window::Window;
@@ -222,7 +222,7 @@ impl PolarScan {
                 }
                 let step = chunk.step[i] as u16;
                 let inside = usize::from(step) < azimuths.steps;
-                if z >= config.clear_height_m_min {
+                if z >= CLEAR_HEIGHT_M_MIN {
                     if z >= config.clearance_m {
                         window.record_hit(window_from_ego.apply(x, y));
                     }
@@ -252,7 +252,7 @@ impl PolarScan {
             self.present[bin] = true;
             let steps_a_m = (dx * dx + dy * dy).sqrt() / dz / config.cell_m;
             let height = |height_m: f32| (height_m - rays.origin_height_m) * steps_a_m;
-            let (from, to) = between(height(config.clear_height_m_min), height(config.clear_height_m_max));
+            let (from, to) = between(height(CLEAR_HEIGHT_M_MIN), height(CLEAR_HEIGHT_M_MAX));
             let steps = azimuths.steps as f32;
             let (first, end) = (round_to_whole(least(from, steps)), round_to_whole(least(to, least(farthest, steps))));
             set_bits(&mut self.low[azimuths.row(bin)], first as usize, end as usize);
@@ -359,7 +359,7 @@ impl Chunk {
         let [ox, oy, oz] = origin_m;
         let (per_m, steps) = (1.0 / config.cell_m, azimuths.steps as f32);
         let [lowest, highest, clearance] =
-            [config.clear_height_m_min, config.clear_height_m_max, config.clearance_m].map(|height_m| height_m - oz);
+            [CLEAR_HEIGHT_M_MIN, CLEAR_HEIGHT_M_MAX, config.clearance_m].map(|height_m| height_m - oz);
         let reliable = config.range_m_max * per_m;
         let n = xs.len();
         let (xs, ys, zs) = (&xs[..n], &ys[..n], &zs[..n]);
@@ -371,7 +371,7 @@ impl Chunk {
             let range = (dx * dx + dy * dy).sqrt() * per_m;
             // For a ray that returns from the ground, the ground is a straight line from under the sensor to the
             // return.
-            let rise = if z < config.clear_height_m_min { -oz } else { z - oz };
+            let rise = if z < CLEAR_HEIGHT_M_MIN { -oz } else { z - oz };
             let steps_a_m = range / rise;
             let (from, to) = between(lowest * steps_a_m, highest * steps_a_m);
             let (under, low) = between(lowest * steps_a_m, clearance * steps_a_m);

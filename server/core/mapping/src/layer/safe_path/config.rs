@@ -6,6 +6,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::value_check::{ConfigValueError, check_cells, check_each};
 
+/// Range within which the sensor does not see the ground, metres; unknown cells before drivable ground are no
+/// obstacles there. 7 is ours, as in the layer `drivability`; not tuned.
+pub(super) const BLIND_ZONE_M: f32 = 7.0;
+
+/// Widest unseen gap between drivable cells of one ring or azimuth that is no obstacle, metres; 0 closes no gap. 1
+/// is ours; not tuned.
+pub(super) const HOLE_M_MAX: f32 = 1.0;
+
+/// Largest distance from the vehicle to a safe point that it drives to directly, metres. 15 is ours; not tuned.
+pub(super) const JOIN_M_MAX: f32 = 15.0;
+
 /// Parameters of the layer `safe_path`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -16,19 +27,11 @@ pub struct SafePathConfig {
     pub extent_m: f32,
     /// Side of a cell, metres. 0.25 is ours; not tuned.
     pub cell_m: f32,
-    /// Range within which the sensor does not see the ground, metres; unknown cells before drivable ground are no
-    /// obstacles there. 7 is ours, as in the layer `drivability`; not tuned.
-    pub blind_zone_m: f32,
-    /// Widest unseen gap between drivable cells of one ring or azimuth that is no obstacle, metres; 0 closes no gap. 1
-    /// is ours; not tuned.
-    pub hole_m_max: f32,
-    /// Largest distance from the vehicle to a safe point that it drives to directly, metres. 15 is ours; not tuned.
-    pub join_m_max: f32,
 }
 
 impl Default for SafePathConfig {
     fn default() -> Self {
-        Self { enabled: true, extent_m: 30.0, cell_m: 0.25, blind_zone_m: 7.0, hole_m_max: 1.0, join_m_max: 15.0 }
+        Self { enabled: true, extent_m: 30.0, cell_m: 0.25 }
     }
 }
 
@@ -38,13 +41,8 @@ impl SafePathConfig {
     /// # Errors
     /// [`ConfigValueError`] for the first value that is not allowed.
     pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
-        let values = [
-            ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
-            ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
-            ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
-            ("hole_m_max", self.hole_m_max, (0.0..=5.0, "0 to 5")),
-            ("join_m_max", self.join_m_max, (0.0..=100.0, "0 to 100")),
-        ];
+        let values =
+            [("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")), ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2"))];
         check_each(at, values)?;
         check_cells(at, self.extent_m, self.cell_m)
     }

@@ -23,7 +23,7 @@ use crate::reach::ReachCell;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 
-use super::config::SafePathConfig;
+use super::config::{BLIND_ZONE_M, HOLE_M_MAX};
 
 /// State of a cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -109,16 +109,16 @@ impl FreeSpace {
 
     /// Computes the states from a map's layers `drivability` and `occupancy` and from what the vehicle can reach;
     /// without `drivability` all cells are unknown.
-    pub fn update(&mut self, sweep: &Sweep, context: &Context<'_>, outline: &Outline, config: &SafePathConfig) {
+    pub fn update(&mut self, sweep: &Sweep, context: &Context<'_>, outline: &Outline) {
         let layer = |name| context.earlier.iter().find(move |layer| layer.name == name);
-        self.project(layer("drivability"), sweep, outline, config);
+        self.project(layer("drivability"), sweep, outline);
         self.add_obstacles(context);
         self.add_occupied_cells(layer("occupancy"));
         self.free_outline(outline);
     }
 
     /// Gives each cell the state of its radial cell.
-    fn project(&mut self, drivability: Option<&Layer>, sweep: &Sweep, outline: &Outline, config: &SafePathConfig) {
+    fn project(&mut self, drivability: Option<&Layer>, sweep: &Sweep, outline: &Outline) {
         let class = drivability.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
         let (Some(layer), Some(class)) = (drivability, class) else { return self.states.fill(State::Unknown) };
         let Geometry::Radial { centre_m, row_radius_m, columns } = &layer.geometry else {
@@ -140,8 +140,8 @@ impl FreeSpace {
         }));
         self.remove_own_returns(sweep, outline);
         let columns = usize::from(*columns);
-        mark_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, config.blind_zone_m);
-        mark_holes(&mut self.of_radial_cell, row_radius_m, columns, config.hole_m_max);
+        mark_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, BLIND_ZONE_M);
+        mark_holes(&mut self.of_radial_cell, row_radius_m, columns, HOLE_M_MAX);
         // State of the cells beyond the radial grid.
         self.of_radial_cell.push(State::Unknown);
         for (state, &cell) in self.states.iter_mut().zip(&self.radial_cell) {

@@ -29,7 +29,7 @@ use crate::reach::config::ReachConfig;
 use crate::sensor::sweep::Sweep;
 
 use class::SafePathClass;
-use config::SafePathConfig;
+use config::{JOIN_M_MAX, SafePathConfig};
 use distance::Distances;
 use free_space::{FreeSpace, State};
 use links::Links;
@@ -104,11 +104,11 @@ impl LayerMaker for SafePath {
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         let outline = context.reach.map_or_else(|| ReachConfig::default().outline(), |reach| reach.config().outline());
-        self.free_space.update(sweep, context, &outline, &self.config);
+        self.free_space.update(sweep, context, &outline);
         self.distances.compute(self.free_space.states());
         let width_cells = f64::from(outline.width_m) / f64::from(self.config.cell_m);
         self.medial_axis.find(self.free_space.states(), &self.distances, width_cells);
-        let join_cells = f64::from(self.config.join_m_max) / f64::from(self.config.cell_m);
+        let join_cells = f64::from(JOIN_M_MAX) / f64::from(self.config.cell_m);
         self.links.link(&self.medial_axis, self.free_space.states(), &self.distances, width_cells, join_cells);
         layer.geometry = self.geometry();
         self.write(layer);

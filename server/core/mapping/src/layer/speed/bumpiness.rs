@@ -16,7 +16,7 @@ use crate::layer::maker::Context;
 use crate::layer::roughness::NOWHERE;
 use crate::sensor::sweep::Sweep;
 
-use super::config::SpeedConfig;
+use super::config::{GRADE_MAX, STEP_M_MAX, SpeedConfig};
 use super::rough_ground::RoughGround;
 
 /// Bumpiness of an obstacle.
@@ -180,7 +180,7 @@ impl HeightMap {
 
     /// Computes the bumpiness of each cell with a point.
     pub fn judge(&mut self, context: &Context<'_>, config: &SpeedConfig) {
-        let over = |distance_m: f32| ((config.step_m_max + config.grade_max * distance_m) * 1000.0) as i32;
+        let over = |distance_m: f32| ((STEP_M_MAX + GRADE_MAX * distance_m) * 1000.0) as i32;
         // The distance is from the centre of a cell to the far side of its neighbour.
         let (over_cells, over_ground) = (over(1.5 * config.cell_m), over(0.0));
         for &index in &self.seen {

@@ -34,7 +34,7 @@ use crate::sensor::sweep::Sweep;
 
 use bumpiness::{HeightMap, OBSTACLE_BUMPINESS};
 use class::{SPEED_SCALE_MPS, SpeedClass};
-use config::SpeedConfig;
+use config::{ROUGH_M, SMOOTH_M, SpeedConfig};
 use corridor::{Corridor, OUTSIDE};
 use measured_road::MeasuredRoad;
 use painting::{NO_ROAD, Painter};
@@ -94,8 +94,8 @@ impl Speed {
 
     /// Speed of a known cell off the road, m/s. It falls linearly with bumpiness, and with the factor of the roughness.
     fn off_road_mps(&self, bumpiness_m: f32, factor: f32) -> f32 {
-        let SpeedConfig { smooth_m, rough_m, crawl_mps, off_road_mps, .. } = self.config;
-        let evenness = ((rough_m - bumpiness_m) / (rough_m - smooth_m)).clamp(0.0, 1.0);
+        let SpeedConfig { crawl_mps, off_road_mps, .. } = self.config;
+        let evenness = ((ROUGH_M - bumpiness_m) / (ROUGH_M - SMOOTH_M)).clamp(0.0, 1.0);
         crawl_mps + (off_road_mps - crawl_mps) * evenness * factor
     }
 
@@ -123,10 +123,10 @@ impl Speed {
 
     /// Finds the road to paint, and paints it and the corridor of the route.
     fn paint(&mut self, sweep: &Sweep, context: &Context<'_>) {
-        self.conditions.check(context, &self.config);
+        self.conditions.check(context);
         if self.config.measure_road && self.conditions.lacks_road() && self.measured_road.measure(sweep) {
             let (points_m, widths_m) = (self.measured_road.points_m(), self.measured_road.widths_m());
-            self.conditions.offer(points_m, widths_m, context, &self.config);
+            self.conditions.offer(points_m, widths_m, context);
         }
         self.painter.clear();
         if self.conditions.painting() {

@@ -5,7 +5,7 @@
 //! side. Each pair of points with its four edge points is one convex piece, which is painted row by row (section
 //! 3.2.1). If pieces overlap, in bends, the larger bonus is kept, so that their order does not matter.
 
-use super::config::{Bonus, SpeedConfig};
+use super::config::{BONUS_REACH_M, Bonus, SpeedConfig};
 
 /// Bonus of a cell that is not on the road.
 pub const NO_ROAD: f32 = -1.0;
@@ -33,7 +33,7 @@ impl Painter {
             cell_m: f64::from(config.cell_m),
             style: config.bonus,
             bonus_max_mps: config.bonus_mps,
-            reach_m: config.bonus_reach_m,
+            reach_m: BONUS_REACH_M,
             bonus_mps: vec![NO_ROAD; side * side],
             painted: false,
             edges: Vec::new(),

@@ -10,7 +10,7 @@
 use crate::layer::maker::Context;
 use crate::road::RoadFrame;
 
-use super::config::SpeedConfig;
+use super::config::{CURVATURE_PER_M_MAX, DIVERGENCE_MIN, ROAD_AGE_MS_MAX, ROUTE_AHEAD_M};
 
 /// Half the length over which the route's curvature is measured, metres. Ours: RDDF rows are metres to hundreds of
 /// metres apart, so the curvature at a corner is that of the circle through the points this far before and behind it.
@@ -60,7 +60,7 @@ pub struct PaintingConditions {
 
 impl PaintingConditions {
     /// Checks all conditions of a map, and computes the road in the ego frame.
-    pub fn check(&mut self, context: &Context<'_>, config: &SpeedConfig) {
+    pub fn check(&mut self, context: &Context<'_>) {
         self.violated.clear();
         self.road_m.clear();
         self.widths_m.clear();
@@ -73,15 +73,15 @@ impl PaintingConditions {
         let age_ns = context.stamp_ns.saturating_sub(stored.road.stamp_ns);
         let ages = stored.road.frame == RoadFrame::Ego;
         // A road with a stamp in the future is no more current than an old one.
-        self.add(Condition::Age, ages && age_ns.unsigned_abs() > u64::from(config.road_age_ms_max) * 1_000_000);
+        self.add(Condition::Age, ages && age_ns.unsigned_abs() > u64::from(ROAD_AGE_MS_MAX) * 1_000_000);
 
         let is_road_placed = stored.points_in_ego(pose, &mut self.road_m);
         self.add(Condition::Pose, !is_road_placed);
         self.widths_m.extend_from_slice(&stored.road.widths_m);
         self.divergence = divergence(&stored.road.orientations);
-        self.add(Condition::Divergence, self.divergence.is_some_and(|found| found < f64::from(config.divergence_min)));
+        self.add(Condition::Divergence, self.divergence.is_some_and(|found| found < f64::from(DIVERGENCE_MIN)));
 
-        self.check_route(context, config);
+        self.check_route(context);
     }
 
     /// True if no road was sent, or only one that is too old.
@@ -90,7 +90,7 @@ impl PaintingConditions {
     }
 
     /// Offers a measured road (ego frame, metres) in place of a road that was not sent or is too old.
-    pub fn offer(&mut self, points_m: &[[f64; 2]], widths_m: &[f64], context: &Context<'_>, config: &SpeedConfig) {
+    pub fn offer(&mut self, points_m: &[[f64; 2]], widths_m: &[f64], context: &Context<'_>) {
         self.violated.clear();
         self.divergence = None;
         self.source = RoadSource::Measured;
@@ -98,16 +98,16 @@ impl PaintingConditions {
         self.road_m.extend_from_slice(points_m);
         self.widths_m.clear();
         self.widths_m.extend_from_slice(widths_m);
-        self.check_route(context, config);
+        self.check_route(context);
     }
 
     /// Checks the conditions of the route.
-    fn check_route(&mut self, context: &Context<'_>, config: &SpeedConfig) {
+    fn check_route(&mut self, context: &Context<'_>) {
         self.add(Condition::Pose, context.route.is_some() && !self.is_route_placed);
         if self.is_route_placed {
-            let curvature = curvature_ahead_per_m(&self.route_m, f64::from(config.route_ahead_m));
+            let curvature = curvature_ahead_per_m(&self.route_m, f64::from(ROUTE_AHEAD_M));
             self.curvature_per_m = Some(curvature);
-            self.add(Condition::Curvature, curvature > f64::from(config.curvature_per_m_max));
+            self.add(Condition::Curvature, curvature > f64::from(CURVATURE_PER_M_MAX));
         }
     }
 

@@ -7,7 +7,7 @@ use crate::layer::roughness::Roughness;
 use crate::sensor::deviation::Deviation;
 use crate::sensor::sweep::Sweep;
 
-use super::config::SpeedConfig;
+use super::config::{ROUGHNESS_ROUGH, ROUGHNESS_SMOOTH, SpeedConfig};
 
 /// Least number of points with a deviation in a cell with a roughness. Ours: that of the layer `terrain`.
 const POINTS_MIN: u16 = 4;
@@ -42,9 +42,8 @@ impl RoughGround {
     /// Factor of the speed above `crawl_mps` of a cell: 1 on smooth ground and without a known roughness, `rough_share`
     /// on rough ground, linear between.
     pub fn factor(&self, cell: usize, config: &SpeedConfig) -> f32 {
-        let SpeedConfig { roughness_smooth, roughness_rough, rough_share, .. } = *config;
         let share =
-            |roughness: f32| ((roughness - roughness_smooth) / (roughness_rough - roughness_smooth)).clamp(0.0, 1.0);
-        1.0 - (1.0 - rough_share) * self.roughness(cell).map_or(0.0, share)
+            |roughness: f32| ((roughness - ROUGHNESS_SMOOTH) / (ROUGHNESS_ROUGH - ROUGHNESS_SMOOTH)).clamp(0.0, 1.0);
+        1.0 - (1.0 - config.rough_share) * self.roughness(cell).map_or(0.0, share)
     }
 }

@@ -8,6 +8,27 @@ use crate::value_check::{ConfigValueError, check_each};
 
 use super::division::Division;
 
+/// Largest local height disturbance of a flat region, m² (eq. 1: a variance). 0.005 is ours, because the paper
+/// gives no threshold (section 2.3); not tuned.
+pub(super) const FLATNESS_M2_MAX: f32 = 0.005;
+
+/// With `variant = "grounded"`: largest distance between a point of a flat region and its plane, metres. 0.15 is
+/// ours; chosen on the labelled frame of BENCHMARKS.md.
+pub(super) const RESIDUAL_M_MAX: f32 = 0.15;
+
+/// With `variant = "grounded"`: largest rise over run of a flat region. 0.2 is ours; chosen on the labelled frame
+/// of BENCHMARKS.md.
+pub(super) const GRADE_MAX: f32 = 0.2;
+
+/// With `variant = "grounded"`: largest height of a flat cell's points over the local ground, metres. 0.25 is ours:
+/// one unit of the layer `drivability`.
+pub(super) const STEP_M_MAX: f32 = 0.25;
+
+/// Standard deviation of the positions of points, metres: a flat region's plane has no slope in a direction in
+/// which its points lie this close together. 0.02 is ours: the range noise of an HDL-64E. The noise that is
+/// subtracted from the roughness (section 2.5) is a property of each sensor: `range_noise_m` of its table.
+pub(super) const NOISE_M: f32 = 0.02;
+
 /// Parameters of the layer `terrain`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -23,29 +44,17 @@ pub struct TerrainConfig {
     pub cell_m: f32,
     /// Largest height of a point over the ground under the vehicle, metres; the vehicle passes under higher ones. 2.5
     /// is ours: the value of the layer `drivability` (UT Austin thesis, section IV.2).
+    #[serde(skip)]
     pub overhang_m: f32,
-    /// Largest local height disturbance of a flat region, m² (eq. 1: a variance). 0.005 is ours, because the paper
-    /// gives no threshold (section 2.3); not tuned.
-    pub flatness_m2_max: f32,
     /// Least number of points of a region that is judged. 3 is ours: as many as define a plane.
+    #[serde(skip)]
     pub points_min: u16,
-    /// With `variant = "grounded"`: largest distance between a point of a flat region and its plane, metres. 0.15 is
-    /// ours; chosen on the labelled frame of BENCHMARKS.md.
-    pub residual_m_max: f32,
-    /// With `variant = "grounded"`: largest rise over run of a flat region. 0.2 is ours; chosen on the labelled frame
-    /// of BENCHMARKS.md.
-    pub grade_max: f32,
-    /// With `variant = "grounded"`: largest height of a flat cell's points over the local ground, metres. 0.25 is ours:
-    /// one unit of the layer `drivability`.
-    pub step_m_max: f32,
     /// With `variant = "grounded"`: widest hole in seen ground that is inferred to be flat, metres. 3 is ours; not
     /// tuned.
+    #[serde(skip)]
     pub inference_m_max: f32,
-    /// Standard deviation of the positions of points, metres: a flat region's plane has no slope in a direction in
-    /// which its points lie this close together. 0.02 is ours: the range noise of an HDL-64E. The noise that is
-    /// subtracted from the roughness (section 2.5) is a property of each sensor: `range_noise_m` of its table.
-    pub noise_m: f32,
     /// Least number of points with a range deviation in a cell with a roughness. 4 is ours; not tuned.
+    #[serde(skip)]
     pub roughness_points_min: u16,
     /// True if the layer has channels for the plane of each flat cell (height and slopes). `false` is ours, because the
     /// channels cost bytes.
@@ -60,13 +69,8 @@ impl Default for TerrainConfig {
             range_m_max: 50.0,
             cell_m: 0.25,
             overhang_m: 2.5,
-            flatness_m2_max: 0.005,
             points_min: 3,
-            residual_m_max: 0.15,
-            grade_max: 0.2,
-            step_m_max: 0.25,
             inference_m_max: 3.0,
-            noise_m: 0.02,
             roughness_points_min: 4,
             planes: false,
         }
@@ -106,16 +110,7 @@ impl TerrainConfig {
             // At most 2000 cells a side.
             ("range_m_max", self.range_m_max, (5.0..=100.0, "5 to 100")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
-            ("overhang_m", self.overhang_m, (0.5..=100.0, "0.5 to 100")),
-            ("flatness_m2_max", self.flatness_m2_max, (1e-6..=1.0, "0.000001 to 1")),
-            ("residual_m_max", self.residual_m_max, (0.01..=10.0, "0.01 to 10")),
-            ("grade_max", self.grade_max, (0.01..=10.0, "0.01 to 10")),
-            ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
-            ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
             // Without noise the plane through a piece of one ring is not defined.
-            ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),
-            ("points_min", self.points_min.into(), (1.0..=1000.0, "1 to 1000")),
-            ("roughness_points_min", self.roughness_points_min.into(), (1.0..=1000.0, "1 to 1000")),
         ];
         check_each(at, values)
     }

@@ -39,7 +39,7 @@ use crate::sensor::rays::ScanExtras;
 use crate::sensor::sweep::Sweep;
 
 use class::{PLANE, ROUGHNESS, SHAPE, TerrainClass};
-use config::{TerrainConfig, Variant};
+use config::{STEP_M_MAX, TerrainConfig, Variant};
 use holes::{Holes, Role};
 use moments::{Cells, half_width};
 use regions::{FIRST_FLAT, NOT_FLAT, Plane, Regions};
@@ -113,8 +113,8 @@ impl Terrain {
         let [x, y] = self.cells.cell_centre_m(self.cells.cell_of_slot(slot));
         let highest_m = self.cells.span_m(slot)[1] - context.ground_m(x, y);
         match region {
-            _ if highest_m > self.config.step_m_max && region == NOT_FLAT => TerrainClass::Obstacle,
-            _ if highest_m > self.config.step_m_max && region >= FIRST_FLAT => TerrainClass::FlatElevated,
+            _ if highest_m > STEP_M_MAX && region == NOT_FLAT => TerrainClass::Obstacle,
+            _ if highest_m > STEP_M_MAX && region >= FIRST_FLAT => TerrainClass::FlatElevated,
             _ if region != NOT_FLAT && region < FIRST_FLAT => TerrainClass::Unknown,
             _ if context.is_reached(x, y) => TerrainClass::Flat,
             _ => TerrainClass::FlatUnreachable,
@@ -128,7 +128,7 @@ impl Terrain {
         let span = (self.config.inference_m_max / self.config.cell_m).round() as usize;
         let is_low = |cell: usize| {
             let [x, y] = cells.cell_centre_m(cell);
-            cells.span_m(cells.slot_of_cell(cell))[1] - context.ground_m(x, y) <= self.config.step_m_max
+            cells.span_m(cells.slot_of_cell(cell))[1] - context.ground_m(x, y) <= STEP_M_MAX
         };
         let role = |cell: usize| match class[cell] {
             TerrainClass::Flat => Role::Flat,

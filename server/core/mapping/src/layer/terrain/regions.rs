@@ -6,7 +6,7 @@
 //! cell, which then is an obstacle.
 
 use super::class::Shape;
-use super::config::{TerrainConfig, Variant};
+use super::config::{FLATNESS_M2_MAX, GRADE_MAX, NOISE_M, RESIDUAL_M_MAX, TerrainConfig, Variant};
 use super::division::Region;
 use super::eigen::Principal;
 use super::moments::{Cells, Moments};
@@ -91,8 +91,8 @@ impl Regions {
             let principal = Principal::from_covariance(moments.covariance());
             let cell = self.cell_of_slot[slot] as usize;
             self.shape_of_cell[cell] = shape(principal.values);
-            let flat = principal.height_disturbance() < f64::from(config.flatness_m2_max);
-            self.of_cell[cell] = if flat { self.add(&moments, config) } else { NOT_FLAT };
+            let flat = principal.height_disturbance() < f64::from(FLATNESS_M2_MAX);
+            self.of_cell[cell] = if flat { self.add(&moments) } else { NOT_FLAT };
         }
     }
 
@@ -111,9 +111,9 @@ impl Regions {
             if moments.points() < f64::from(config.points_min) {
                 continue;
             }
-            if division.judges(&region) && is_flat(&moments, f64::from(config.flatness_m2_max)) {
-                let plane = Plane::fit(&moments, config.noise_m);
-                if config.variant == Variant::Paper || is_ground_like(&plane, cells, from..to, config) {
+            if division.judges(&region) && is_flat(&moments, f64::from(FLATNESS_M2_MAX)) {
+                let plane = Plane::fit(&moments, NOISE_M);
+                if config.variant == Variant::Paper || is_ground_like(&plane, cells, from..to) {
                     self.planes.push(plane);
                     self.paint(cells.width(), cells.extent(&region), FIRST_FLAT + self.planes.len() as u32 - 1);
                     continue;
@@ -128,8 +128,8 @@ impl Regions {
     }
 
     /// Adds a flat region; returns the value for its cells.
-    fn add(&mut self, moments: &Moments, config: &TerrainConfig) -> u32 {
-        self.planes.push(Plane::fit(moments, config.noise_m));
+    fn add(&mut self, moments: &Moments) -> u32 {
+        self.planes.push(Plane::fit(moments, NOISE_M));
         FIRST_FLAT + self.planes.len() as u32 - 1
     }
 
@@ -188,12 +188,12 @@ fn is_flat(moments: &Moments, flatness_m2_max: f64) -> bool {
 }
 
 /// True if no point of a flat region lies off its plane, and the plane is not too steep. Not in the paper.
-fn is_ground_like(plane: &Plane, cells: &Cells, slots: std::ops::Range<usize>, config: &TerrainConfig) -> bool {
-    if plane.grade() > config.grade_max {
+fn is_ground_like(plane: &Plane, cells: &Cells, slots: std::ops::Range<usize>) -> bool {
+    if plane.grade() > GRADE_MAX {
         return false;
     }
     let [a, b, _] = plane.0;
-    let allowed = config.residual_m_max + (a.abs() + b.abs()) * cells.cell_m() / 2.0;
+    let allowed = RESIDUAL_M_MAX + (a.abs() + b.abs()) * cells.cell_m() / 2.0;
     slots.into_iter().all(|slot| {
         let [x, y] = cells.cell_centre_m(cells.cell_of_slot(slot));
         let height = plane.height_m(x, y);

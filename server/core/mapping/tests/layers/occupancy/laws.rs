@@ -43,13 +43,13 @@ proptest! {
     #[test]
     fn each_cell_is_written_and_the_order_of_points_does_not_matter(
         scans in prop::collection::vec(any_scan(), 1..4), cell_m in 0.2f32..1.0, range_m_max in 5f32..200.0,
-        no_return_m in 0f32..100.0, hits_slow in 1u8..40, hits_fast in 1u8..3, seed in any::<u64>(),
+        no_return_m in 0f32..100.0, seed in any::<u64>(),
         is_paper in any::<bool>(), is_counted in any::<bool>(),
     ) {
         let variant = if is_paper { OccupancyVariant::Paper } else { OccupancyVariant::Polar };
         let hits = if is_counted { Hits::Counted } else { Hits::Reduced };
         let config = OccupancyConfig {
-            variant, cell_m, range_m_max, no_return_m, hits_slow, hits_fast, hits, ..OccupancyConfig::default()
+            variant, cell_m, range_m_max, no_return_m, hits, ..OccupancyConfig::default()
         };
         let [mut map, mut again] = [Occupancy::new(&config), Occupancy::new(&config)];
         for (points, no_returns, origin_m, sensor, map_from_ego) in &scans {

@@ -140,7 +140,7 @@ fn hits_add_up_saturate_and_fade() {
 
 #[test]
 fn a_faster_vehicle_needs_fewer_hits() {
-    let needed = |speed_mps| Occupancy::hits_needed(&OccupancyConfig::default(), speed_mps);
+    let needed = Occupancy::hits_needed;
     let speeds = [0.0, 4.4, 4.5, 15.6, 26.7, 26.8, 60.0, -26.8];
     assert_eq!(speeds.map(|speed| needed(Some(speed))), [20, 20, 20, 11, 3, 2, 2, 2]);
     assert_eq!(needed(None), 2, "an unknown speed may be fast");
