@@ -5,23 +5,21 @@
 //!
 //! | file | in -> out |
 //! |---|---|
+//! | [`options`] | what is judged -> a configuration of the maps |
 //! | [`source`] | paths, scenes, seeds -> maps, and the truth about their points |
 //! | [`judge`] | a layer and points of known truth -> counts |
 //! | [`tally`] | counts -> sums and shares |
 //! | [`report`] | counts -> JSON |
 //! | [`table`] | counts -> tables |
 
-use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Result, bail};
-use clearway_daemon::config::Config;
-use clearway_lidar::model::Model;
-use clearway_mapping::config::{Extrinsics, MapsConfig};
 
 use crate::scenes::{self, NamedScene, SCENES};
 
 pub mod judge;
+pub mod options;
 pub mod report;
 pub mod source;
 mod table;
@@ -31,52 +29,9 @@ use report::{EvaluatedSource, Evaluation};
 use source::pairs::{LabelledScans, find_pairs};
 use source::random::judge_random_worlds;
 use source::scans::judge_folder;
-use source::variation::Variation;
 use source::worlds;
 
-/// Seeds of the random worlds that are judged by default: every form of ground with every theme, once in even and once
-/// in odd seeds.
-pub const SEEDS: Range<u64> = 0..156;
-
-/// What is judged, and how.
-#[derive(Clone, Debug)]
-pub struct EvaluateOptions {
-    /// Folders with scans and labels, scans, `sim:` with the name of a scene, or `sim:random`.
-    pub paths: Vec<String>,
-    /// Labels of the scans, a folder or a file; inside the paths themselves if `None`.
-    pub labels: Option<PathBuf>,
-    /// Position and orientation of the scans' sensor in the ego frame; as on KITTI's car if `None`.
-    pub extrinsics: Option<Extrinsics>,
-    /// Model of the sensor. `None`: of scans, the rings in the file define the rows of radial maps, or an HDL-64E if
-    /// the file has no rings; of simulated scenes, an HDL-64E.
-    pub model: Option<Model>,
-    /// The variations of each labelled scan that are judged, in the order of the report.
-    pub variations: Vec<Variation>,
-    /// Folder to which each scan and its truth is written, but not those of `sim:` other than `sim:random`.
-    pub write_scans: Option<PathBuf>,
-    /// Seeds of the random worlds.
-    pub seeds: Range<u64>,
-    /// Configuration of the maps, those of its first vehicle; the default configuration if `None`.
-    pub config: Option<PathBuf>,
-    /// Overrides of keys of the configuration.
-    pub set: Vec<String>,
-}
-
-impl Default for EvaluateOptions {
-    fn default() -> Self {
-        Self {
-            paths: Vec::new(),
-            labels: None,
-            extrinsics: None,
-            model: None,
-            variations: vec![Variation::Recorded],
-            write_scans: None,
-            seeds: SEEDS,
-            config: None,
-            set: Vec::new(),
-        }
-    }
-}
+pub use options::EvaluateOptions;
 
 /// Judges every map that the configuration enables. `progress` is called with the number of frames judged and of all
 /// frames.
@@ -138,19 +93,6 @@ impl Input {
             Self::Random => options.seeds.clone().count() as u64,
             Self::Labelled(found) => (found.pairs.len() * options.variations.len()) as u64,
         }
-    }
-}
-
-impl EvaluateOptions {
-    fn maps(&self) -> Result<MapsConfig> {
-        let config = match &self.config {
-            Some(file) => Config::load(file, &self.set)?,
-            None => {
-                let text = Config::of_one_vehicle("car", "top").to_toml();
-                Config::parse(&text, Path::new("the default configuration"), &self.set)?
-            }
-        };
-        Ok(config.vehicles.into_iter().next().map(|vehicle| vehicle.maps).unwrap_or_default())
     }
 }
 

@@ -1,8 +1,11 @@
 //! Whole evaluations of hand-made scans and of a simulated scene.
 
-use super::*;
+use std::ops::Range;
 
 use clearway_mapping::config::Extrinsics;
+
+use super::source::variation::Variation;
+use super::*;
 
 const LEVEL: Extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.73, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
 

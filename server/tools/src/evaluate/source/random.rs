@@ -13,7 +13,7 @@ use clearway_mapping::config::MapsConfig;
 use clearway_sim::random::{Form, RandomWorld, Theme, random_world};
 use clearway_sim::scanner::ScannerConfig;
 
-use super::super::EvaluateOptions;
+use super::super::options::EvaluateOptions;
 use super::super::report::{EvaluatedRow, EvaluatedSource, EvaluatedWorld};
 use super::worlds::drive;
 use super::written::{WrittenFrame, write_sweep};

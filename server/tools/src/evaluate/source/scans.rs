@@ -15,8 +15,8 @@ use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::mount::estimate;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 
-use super::super::EvaluateOptions;
 use super::super::judge::{JudgedPoint, Scored, Vote};
+use super::super::options::EvaluateOptions;
 use super::super::report::EvaluatedSource;
 use super::labels;
 use super::pairs::LabelledScan;
