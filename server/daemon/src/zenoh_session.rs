@@ -10,8 +10,8 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::session::ZenohId;
 use zenoh::{Config, Session};
 
+use crate::base::token_bucket::TokenBucket;
 use crate::config::{Zenoh as Options, ZenohMode};
-use crate::publish::listen::Budget;
 
 /// What one peer may cost: zenoh's setting, value in JSON5. A file named in `[zenoh]` has its own values; the files in
 /// `deploy/zenoh` have these. All values are ours, for the reasons beside them.
@@ -130,7 +130,7 @@ struct PeerNames {
     names: BTreeMap<ZenohId, String>,
     read: Option<Instant>,
     /// Reads because of unknown peers: who invents their ids does not keep the server reading.
-    reads: Budget,
+    reads: TokenBucket,
 }
 
 impl PeerNames {
@@ -141,7 +141,7 @@ impl PeerNames {
     const READS_PER_SECOND: u32 = 20;
 
     fn new(session: &Session) -> Self {
-        let reads = Budget::new(Self::READS_AT_ONCE, Self::READS_PER_SECOND);
+        let reads = TokenBucket::new(Self::READS_AT_ONCE, Self::READS_PER_SECOND);
         Self { session: session.clone(), names: BTreeMap::new(), read: None, reads }
     }
 

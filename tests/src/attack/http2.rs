@@ -5,19 +5,29 @@ use std::net::SocketAddr;
 
 use clearway_proto::v1;
 use prost::Message;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;
 
-/// Types of frames.
-const DATA: u8 = 0;
-const HEADERS: u8 = 1;
-const RESET: u8 = 3;
-const SETTINGS: u8 = 4;
-const PING: u8 = 6;
-const WINDOW_UPDATE: u8 = 8;
-/// Flags of frames.
-const ACKNOWLEDGED: u8 = 1;
-const END_HEADERS: u8 = 4;
+/// Type of a frame: bytes of a stream.
+pub const DATA: u8 = 0;
+/// Type of a frame: the head of a request.
+pub const HEADERS: u8 = 1;
+/// Type of a frame: the end of a stream.
+pub const RESET: u8 = 3;
+/// Type of a frame: settings of the connection.
+pub const SETTINGS: u8 = 4;
+/// Type of a frame: a question whether the peer is there.
+pub const PING: u8 = 6;
+/// Type of a frame: more bytes may be sent.
+pub const WINDOW_UPDATE: u8 = 8;
+/// Type of a frame: the rest of a head.
+pub const CONTINUATION: u8 = 9;
+/// Flag of a frame of type `PING` or `SETTINGS`: it is an answer.
+pub const ACKNOWLEDGED: u8 = 1;
+/// Flag of a frame of type `DATA`: the stream ends with it.
+pub const END_STREAM: u8 = 1;
+/// Flag of a frame of type `HEADERS`: the head ends with it.
+pub const END_HEADERS: u8 = 4;
 /// Setting: window of a new stream.
 const INITIAL_WINDOW: u16 = 4;
 /// The path of the streams of maps.
@@ -34,17 +44,26 @@ pub fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
 /// The preface of a client whose streams have this window; the window of the connection is as large, if it is more than
 /// HTTP/2's default.
 pub fn opening(stream_window: u32) -> Vec<u8> {
-    let settings = [&INITIAL_WINDOW.to_be_bytes()[..], &stream_window.to_be_bytes()].concat();
     let mut bytes = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec();
-    bytes.extend(frame(SETTINGS, 0, 0, &settings));
+    bytes.extend(settings(stream_window));
     if stream_window > 65_535 {
         bytes.extend(frame(WINDOW_UPDATE, 0, 0, &(stream_window - 65_535).to_be_bytes()));
     }
     bytes
 }
 
+/// The setting of the window of new streams.
+pub fn settings(stream_window: u32) -> Vec<u8> {
+    frame(SETTINGS, 0, 0, &[&INITIAL_WINDOW.to_be_bytes()[..], &stream_window.to_be_bytes()].concat())
+}
+
 /// The head of a gRPC call on a stream with an odd number.
 pub fn call(stream: u32, path: &str) -> Vec<u8> {
+    frame(HEADERS, END_HEADERS, stream, &header_block(path))
+}
+
+/// The header block of a gRPC call, without compression (RFC 7541).
+pub fn header_block(path: &str) -> Vec<u8> {
     let kind = b"application/grpc";
     let length = |text: &[u8]| u8::try_from(text.len()).expect("a short header");
     // POST, http; path, authority, content-type and te as literals without index.
@@ -54,14 +73,18 @@ pub fn call(stream: u32, path: &str) -> Vec<u8> {
     headers.push(length(kind));
     headers.extend(kind);
     headers.extend(b"\x00\x02te\x08trailers");
-    frame(HEADERS, END_HEADERS, stream, &headers)
+    headers
 }
 
 /// A message of a gRPC call.
 pub fn message(stream: u32, message: &impl Message) -> Vec<u8> {
     let encoded = message.encode_to_vec();
-    let length = u32::try_from(encoded.len()).expect("a short message").to_be_bytes();
-    frame(DATA, 0, stream, &[&[0], &length[..], &encoded].concat())
+    claimed_message(stream, u32::try_from(encoded.len()).expect("a short message"), &encoded)
+}
+
+/// The beginning of a message of a gRPC call that claims this length.
+pub fn claimed_message(stream: u32, length: u32, begin: &[u8]) -> Vec<u8> {
+    frame(DATA, 0, stream, &[&[0], &length.to_be_bytes()[..], begin].concat())
 }
 
 /// A `Watch` of all layers of the only vehicle, by a reader that never acknowledges.
@@ -89,37 +112,4 @@ pub async fn never_read(address: SocketAddr, connections: usize, streams: u32) -
         held.push(stream);
     }
     Ok(held)
-}
-
-/// Opens one stream of maps with a window of `window` bytes, grants no more, and answers every ping and settings frame
-/// until the server closes the connection. Returns the number of bytes of maps received.
-///
-/// # Errors
-/// If the server does not accept the connection.
-pub async fn answer_pings_only(address: SocketAddr, window: u32) -> io::Result<usize> {
-    let mut stream = TcpStream::connect(address).await?;
-    stream.write_all(&[opening(window), watch(1)].concat()).await?;
-    let mut maps = 0;
-    loop {
-        let mut head = [0; 9];
-        if stream.read_exact(&mut head).await.is_err() {
-            return Ok(maps);
-        }
-        let mut payload = vec![0; u32::from_be_bytes([0, head[0], head[1], head[2]]) as usize];
-        if stream.read_exact(&mut payload).await.is_err() {
-            return Ok(maps);
-        }
-        let answer = match (head[3], head[4] & ACKNOWLEDGED) {
-            (PING, 0) => frame(PING, ACKNOWLEDGED, 0, &payload),
-            (SETTINGS, 0) => frame(SETTINGS, ACKNOWLEDGED, 0, &[]),
-            (DATA, _) => {
-                maps += payload.len();
-                continue;
-            }
-            _ => continue,
-        };
-        if stream.write_all(&answer).await.is_err() {
-            return Ok(maps);
-        }
-    }
 }

@@ -4,7 +4,9 @@
 //! | file | what it does |
 //! |---|---|
 //! | [`sockets`] | opens connections that send nothing, or never a whole request |
-//! | [`http2`] | opens gRPC streams that are never read, answers pings, resets streams |
+//! | [`http2`] | opens gRPC streams that are never read, resets streams |
+//! | [`websocket`] | frames of a WebSocket |
 
 pub mod http2;
 pub mod sockets;
+pub mod websocket;

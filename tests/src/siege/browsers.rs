@@ -9,6 +9,7 @@ use futures::future::select;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use super::target::{Attack, connect};
+use crate::attack::websocket::{PING, TEXT, masked};
 
 /// Pause before a connection that was cut is opened again.
 const AGAIN: Duration = Duration::from_millis(20);
@@ -37,18 +38,12 @@ pub const ATTACKS: &[Attack] = &[
     },
 ];
 
-/// A frame of a WebSocket, masked with zeros.
-fn frame(opcode: u8, payload: &[u8]) -> Vec<u8> {
-    let length = u8::try_from(payload.len()).ok().filter(|length| *length < 126).expect("a short message");
-    [&[0x80 | opcode, 0x80 | length, 0, 0, 0, 0], payload].concat()
-}
-
 fn pings() -> Vec<u8> {
-    frame(9, &[7; 125]).repeat(100)
+    masked(PING, &[7; 125]).repeat(100)
 }
 
 fn selections() -> Vec<u8> {
-    frame(1, SELECTION.as_bytes()).repeat(100)
+    masked(TEXT, SELECTION.as_bytes()).repeat(100)
 }
 
 /// Sends a beginning and then this without pause, on one connection after another, and reads all answers.
@@ -96,7 +91,7 @@ async fn subscriptions(at: SocketAddr) {
     let wanted = (0..SUBSCRIPTIONS).flat_map(|id| {
         let channel = id % CHANNELS + 1;
         let wanted = format!(r#"{{"op":"subscribe","subscriptions":[{{"id":{id},"channelId":{channel}}}]}}"#);
-        frame(1, wanted.as_bytes())
+        masked(TEXT, wanted.as_bytes())
     });
     let bytes = [FOXGLOVE, &wanted.collect::<Vec<_>>()].concat();
     let hold = |_| async {

@@ -30,7 +30,7 @@ pub const ATTACKS: &[Attack] = &[
 ];
 
 const REQUEST: &[u8] = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n";
-const UPGRADE: &[u8] = b"GET /live?vehicle=car HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n\
+const UPGRADE: &[u8] = b"GET /live HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n\
     Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
 
 fn zenoh(target: &Target) -> SocketAddr {

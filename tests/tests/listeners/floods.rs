@@ -1,17 +1,15 @@
-//! Clients that send what carries nothing as fast as they can: frames of HTTP/2 without data, frames of a WebSocket.
+//! Clients that send frames without data as fast as they can: of HTTP/2 and of a WebSocket.
 
 use std::net::SocketAddr;
 
 use clearway_daemon::run::Running;
-use clearway_proto::v1;
 use clearway_tests::attack::http2::{self, frame};
+use clearway_tests::attack::websocket::{PING, masked};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use super::{everything, metric};
-use crate::fixture::{self, PING, feed, readings, start, within};
-
-const LIST: &str = "/clearway.v1.MapService/ListVehicles";
+use crate::fixture::{self, feed, readings, start, within};
 
 /// Sends a flood until the server closes the connection.
 async fn flood(mut stream: TcpStream, bytes: &[u8]) {
@@ -27,26 +25,36 @@ async fn floods(running: &Running, listener: &str) -> f64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn frames_without_data_end_their_connection_and_no_other() {
+async fn a_healthy_reader_is_served_beside_floods_of_frames_without_data() {
     let running = start(everything()).await;
-    feed(&running, readings(2)).await;
     let mut healthy = fixture::grpc(&running).await;
     let first = tokio_stream::once(fixture::selection("car", &[], 0));
     let mut maps = healthy.watch(first).await.unwrap().into_inner();
     let address = running.grpc.unwrap();
     // PRIORITY of a stream that never was, SETTINGS, PING, its answer, WINDOW_UPDATE, and an unknown type.
     let kinds = [(2, 0, 9, 5), (4, 0, 0, 0), (6, 0, 0, 8), (6, 1, 0, 8), (8, 0, 0, 4), (77, 0, 0, 100)];
-    for (kind, flags, stream, length) in kinds {
-        let mut payload = vec![0; length];
-        // A window grows by one.
-        payload.last_mut().into_iter().for_each(|last| *last = 1);
-        let attacker = TcpStream::connect(address).await.unwrap();
-        let bytes = [http2::opening(65_535), frame(kind, flags, stream, &payload).repeat(100_000)].concat();
-        flood(attacker, &bytes).await;
+    let attackers: Vec<_> = kinds
+        .map(|(kind, flags, stream, length)| {
+            tokio::spawn(async move {
+                let bytes = frame(kind, flags, stream, &vec![0; length]).repeat(1000);
+                loop {
+                    let Ok(mut attacker) = TcpStream::connect(address).await else { continue };
+                    let (mut read, mut write) = attacker.split();
+                    let send = async {
+                        let _ = write.write_all(&http2::opening(65_535)).await;
+                        while write.write_all(&bytes).await.is_ok() {}
+                    };
+                    let receive = async { while read.read(&mut [0; 4096]).await.is_ok_and(|length| length > 0) {} };
+                    futures::future::join(send, receive).await;
+                }
+            })
+        })
+        .into();
+    for _ in 0..5 {
+        feed(&running, readings(2)).await;
+        within("a map", maps.message()).await.unwrap().expect("the healthy reader is served on");
     }
-    assert_eq!(floods(&running, "grpc").await, 6.0);
-    feed(&running, readings(2)).await;
-    within("a map", maps.message()).await.unwrap().expect("the healthy reader is served on");
+    attackers.iter().for_each(tokio::task::JoinHandle::abort);
     drop((maps, healthy));
     within("shutdown", running.shutdown()).await.unwrap();
 }
@@ -70,41 +78,6 @@ async fn what_http2_itself_ends_is_counted() {
     let mistakes = "clearway_connections_closed_total{listener=\"grpc\",reason=\"http2\"}";
     assert_eq!(metric(&running, mistakes).await, 1.0);
     within("shutdown", running.shutdown()).await.unwrap();
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_client_that_answers_each_piece_of_a_response_with_three_frames_is_served() {
-    let running = start(everything()).await;
-    let mut stream = TcpStream::connect(running.grpc.unwrap()).await.unwrap();
-    stream.write_all(&http2::opening(65_535)).await.unwrap();
-    let grown = |of: u32| frame(8, 0, of, &16_384_u32.to_be_bytes());
-    for number in 0..1500 {
-        let id = 2 * number + 1;
-        let end = frame(0, 1, id, &[]);
-        let asked = [http2::call(id, LIST), http2::message(id, &v1::ListVehiclesRequest {}), end];
-        stream.write_all(&asked.concat()).await.unwrap();
-        loop {
-            let mut head = [0; 9];
-            within("a frame", stream.read_exact(&mut head)).await.expect("it is served on");
-            let mut payload = vec![0; u32::from_be_bytes([0, head[0], head[1], head[2]]) as usize];
-            within("a frame", stream.read_exact(&mut payload)).await.expect("it is served on");
-            match (head[3], head[4] & 1) {
-                (0, _) => stream.write_all(&[grown(0), grown(id), frame(6, 0, 0, &[7; 8])].concat()).await.unwrap(),
-                // The trailers.
-                (1, 1) => break,
-                _ => {}
-            }
-        }
-    }
-    assert_eq!(floods(&running, "grpc").await, 0.0);
-    drop(stream);
-    within("shutdown", running.shutdown()).await.unwrap();
-}
-
-/// A frame of a WebSocket, masked with zeros.
-fn message(opcode: u8, payload: &[u8]) -> Vec<u8> {
-    let length = u8::try_from(payload.len()).ok().filter(|length| *length < 126).expect("a short message");
-    [&[0x80 | opcode, 0x80 | length, 0, 0, 0, 0], payload].concat()
 }
 
 /// A WebSocket of each listener that has one.
@@ -132,7 +105,7 @@ async fn frames_of_a_websocket_end_it_if_they_are_too_many() {
     let running = start(everything()).await;
     for (opcode, payload) in [(9, &[7; 125][..]), (10, b"an answer"), (1, br#"{"type":"detail","vehicle":"car"}"#)] {
         for (_, stream) in sockets(&running).await {
-            flood(stream, &message(opcode, payload).repeat(1000)).await;
+            flood(stream, &masked(opcode, payload).repeat(1000)).await;
         }
     }
     assert_eq!([floods(&running, "page").await, floods(&running, "foxglove").await], [3.0, 3.0]);
@@ -159,7 +132,7 @@ async fn a_frame_of_a_websocket_that_claims_too_much_ends_it_before_it_has_come(
 async fn a_browsers_new_selection_ends_the_one_before_it_also_while_the_browser_does_not_read() {
     let running = start(everything()).await;
     let mut stream = fixture::web_socket(running.page.unwrap(), "/live").await;
-    let wanted = message(1, br#"{"type":"watch","vehicle":"car","layers":["speed"]}"#);
+    let wanted = masked(1, br#"{"type":"watch","vehicle":"car","layers":["speed"]}"#);
     stream.write_all(&wanted.repeat(200)).await.unwrap();
     let mut answers = 0;
     // No ping is answered, so nothing but answers is sent.
@@ -169,7 +142,7 @@ async fn a_browsers_new_selection_ends_the_one_before_it_also_while_the_browser_
     }
     let readers = "clearway_readers{vehicle=\"car\",transport=\"page\"}";
     assert_eq!(metric(&running, readers).await, 1.0);
-    stream.write_all(&message(1, br#"{"type":"unwatch","vehicle":"car"}"#)).await.unwrap();
+    stream.write_all(&masked(1, br#"{"type":"unwatch","vehicle":"car"}"#)).await.unwrap();
     within("no reader is left", async {
         while metric(&running, readers).await > 0.0 {
             tokio::task::yield_now().await;

@@ -30,7 +30,7 @@ async fn every_path_asks_for_a_certificate_or_a_token_with_a_role() {
         (page, "/", [401, 0, 403, 200, 403, 200]),
         (page, "/main.js", [401, 0, 403, 200, 403, 200]),
         // 400: it is no WebSocket.
-        (page, "/live?vehicle=car", [401, 0, 403, 400, 403, 400]),
+        (page, "/live", [401, 0, 403, 400, 403, 400]),
         (foxglove, "/", [401, 0, 403, 400, 403, 400]),
     ] {
         for (caller, expected) in callers.into_iter().zip(expected) {

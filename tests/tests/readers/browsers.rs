@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::net::SocketAddr;
 
 use clearway_proto::v1;
+use clearway_tests::attack::websocket::{PING, PONG, TEXT, masked};
 use prost::Message;
 use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -12,7 +13,7 @@ use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
 use super::bad::Link;
 use super::{LAYER, portions};
-use crate::fixture::{PING, config, feed, frame, grpc, pong, sequence, start, until, web_socket, within};
+use crate::fixture::{config, feed, frame, grpc, sequence, start, until, web_socket, within};
 
 /// A browser's WebSocket: it reads and answers pings by itself, whatever the page does.
 struct Browser {
@@ -42,7 +43,7 @@ impl Browser {
         tokio::spawn(async move {
             while let Ok((opcode, payload)) = frame(&mut reads).await {
                 let taken = match (opcode, answers.upgrade()) {
-                    (PING, Some(answers)) => answers.send(pong(&payload)).is_ok(),
+                    (PING, Some(answers)) => answers.send(masked(PONG, &payload)).is_ok(),
                     (PING, None) => false,
                     other => received.send((other.0, payload)).is_ok(),
                 };
@@ -57,22 +58,18 @@ impl Browser {
     /// Watches one layer as the page does: at most two maps are on the way.
     async fn open(address: SocketAddr) -> Self {
         let mut browser = Self::new(web_socket(address, "/live").await);
-        browser.say(&format!(r#"{{"type":"watch","vehicle":"car","id":1,"layers":["{LAYER}"],"max_in_flight":2}}"#));
-        browser.text_of("watching").await;
+        browser.watch().await;
         browser
+    }
+
+    async fn watch(&mut self) {
+        self.say(&format!(r#"{{"type":"watch","vehicle":"car","id":1,"layers":["{LAYER}"],"max_in_flight":2}}"#));
+        self.text_of("watching").await;
     }
 
     /// Sends a text in a frame that is masked with zeros.
     fn say(&self, text: &str) {
-        let length = u8::try_from(text.len()).unwrap();
-        let mut bytes = vec![0x81];
-        match length {
-            0..126 => bytes.push(0x80 | length),
-            _ => bytes.extend([0x80 | 126, 0, length]),
-        }
-        bytes.extend([0; 4]);
-        bytes.extend(text.as_bytes());
-        self.said.send(bytes).expect("the connection is open");
+        self.said.send(masked(TEXT, text.as_bytes())).expect("the connection is open");
     }
 
     fn acknowledge(&self, sequence: u64) {
@@ -160,20 +157,21 @@ async fn a_peer_that_answers_no_ping_is_sent_nothing_and_then_the_newest_map() {
     let mut config = config();
     config.page.enabled = true;
     let running = start(config).await;
-    let mut socket = web_socket(running.page.unwrap(), "/live?vehicle=car").await;
+    let mut socket = web_socket(running.page.unwrap(), "/live").await;
     let mut ping = [0; 10];
     within("a ping", socket.read_exact(&mut ping)).await.unwrap();
     assert_eq!(ping[..2], [0x89, 8], "a ping of 8 bytes is first");
     // An answer that was not read from the ping is none.
-    socket.write_all(&pong(b"a guess!")).await.unwrap();
+    socket.write_all(&masked(PONG, b"a guess!")).await.unwrap();
+    let mut browser = Browser::new(socket);
+    browser.watch().await;
     let mut made = 0;
     for portion in portions(6) {
         made = feed(&running, portion).await;
     }
     assert!(made > 3);
-    socket.write_all(&pong(&ping[2..])).await.unwrap();
-    let mut browser = Browser::new(socket);
-    browser.text_of("status").await;
+    browser.said.send(masked(PONG, &ping[2..])).expect("the connection is open");
+    browser.text_of("fleet").await;
     assert_eq!(browser.map().await.0, made - 1, "none of the maps before was sent");
     within("shutdown", running.shutdown()).await.unwrap();
 }

@@ -7,6 +7,7 @@ use bytes::Bytes;
 use clearway_daemon::run::{Server, Setup};
 use clearway_proto::v1;
 use clearway_sim::send::{Pace, Until, drive};
+use clearway_tests::attack::websocket::{PING, PONG, TEXT, masked};
 use tokio::net::UdpSocket;
 use tokio::sync::mpsc;
 use tonic::{Code, Streaming};
@@ -14,8 +15,7 @@ use zenoh::Session;
 use zenoh_ext::{AdvancedSubscriberBuilderExt, HistoryConfig};
 
 use crate::fixture::{
-    self, PING, config, feed, frame, grpc, pong, readings, recorded, selection, sequence, start, until, vehicle,
-    web_socket, within,
+    self, config, feed, frame, grpc, readings, recorded, selection, sequence, start, until, vehicle, web_socket, within,
 };
 
 const LAYER: &str = "drivability";
@@ -312,14 +312,22 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
     assert_eq!(vehicles[0]["name"], "car");
 
     use tokio::io::AsyncWriteExt;
-    let mut stream = web_socket(address, "/live?vehicle=car").await;
+    let mut stream = web_socket(address, "/live").await;
+    for text in [r#"{"type":"detail","vehicle":"car"}"#, r#"{"type":"watch","vehicle":"car"}"#] {
+        stream.write_all(&masked(TEXT, text.as_bytes())).await.unwrap();
+    }
     let (mut update, mut status) = (None, None);
     within("a map and a status", async {
         while update.is_none() || status.is_none() {
             match frame(&mut stream).await.unwrap() {
-                (PING, says) => stream.write_all(&pong(&says)).await.unwrap(),
+                (PING, says) => stream.write_all(&masked(PONG, &says)).await.unwrap(),
                 (2, payload) => update = Some(<v1::MapUpdate as prost::Message>::decode(&payload[..]).unwrap()),
-                (1, payload) => status = Some(serde_json::from_slice::<serde_json::Value>(&payload).unwrap()),
+                (TEXT, payload) => {
+                    let text = serde_json::from_slice::<serde_json::Value>(&payload).unwrap();
+                    if text["type"] == "fleet" {
+                        status = Some(text);
+                    }
+                }
                 other => panic!("{other:?}"),
             }
         }
@@ -327,7 +335,7 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
     .await;
     assert_eq!(update.unwrap().map, newest.select(&[]));
     let status = status.unwrap();
-    assert_eq!((&status["type"], &status["ledger"]["lost"]), (&"status".into(), &0.into()));
+    assert_eq!(status["vehicles"][0]["ledger"]["lost"], 0);
     drop(stream);
     within("shutdown", running.shutdown()).await.unwrap();
 }

@@ -22,7 +22,7 @@ use super::engine_time::{EngineTime, Sender, Waiting};
 use super::gateway::{Gateway, Gateways};
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 use super::stream_places::StreamPlace;
-use crate::publish::listen::Place;
+use crate::publish::listen::CallPermit;
 use crate::publish::listen::access::Caller;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
@@ -57,10 +57,10 @@ impl IngestService for Ingest {
         request: Request<Streaming<v1::Observation>>,
     ) -> Result<Response<Self::StreamStream>, Status> {
         let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
-        let connection = request.extensions().get::<Arc<Place>>().cloned();
-        let host = connection.as_ref().map_or(Ipv4Addr::UNSPECIFIED.into(), |place| place.host());
+        let slot = request.extensions().get::<Arc<CallPermit>>().map(|call| call.slot.clone());
+        let host = slot.as_ref().map_or(Ipv4Addr::UNSPECIFIED.into(), |slot| slot.address());
         let full = |of: &str, error| {
-            connection.as_ref().inspect(|place| place.count("streams"));
+            slot.as_ref().inspect(|slot| slot.count("streams"));
             Status::resource_exhausted(format!("{of}: {error}; close one first"))
         };
         let unnamed = self.gateways.take_unnamed_stream(host);

@@ -30,9 +30,10 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 
 use super::listen::access::Caller;
-use super::listen::{Budget, InProgress, Listener, Place, READ_BUFFER_BYTES};
+use super::listen::{CallPermit, ConnectionSlot, Listener, READ_BUFFER_BYTES};
 use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
+use crate::base::token_bucket::TokenBucket;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
 use crate::engine::newest::NewestSweep;
@@ -279,7 +280,7 @@ fn view(map: &EncodedMap, bytes: Bytes) -> Option<MapView> {
 async fn connect(
     State(all): State<All>,
     Extension(caller): Extension<Caller>,
-    Extension(place): Extension<Arc<Place>>,
+    Extension(call): Extension<Arc<CallPermit>>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
     let upgrade = upgrade.protocols([PROTOCOL]).max_message_size(MESSAGE_BYTES_MAX).max_frame_size(MESSAGE_BYTES_MAX);
@@ -287,12 +288,11 @@ async fn connect(
     if upgrade.selected_protocol().is_none() {
         return (StatusCode::BAD_REQUEST, format!("the protocol {PROTOCOL} is needed\n")).into_response();
     }
-    let in_progress = place.begin_request();
     upgrade.on_upgrade(move |socket| async move {
         let mut published = all.published.subscribe();
         published.mark_changed();
-        let client = Client { all, caller, subscriptions: BTreeMap::new(), in_progress };
-        client.run(socket, published).await;
+        let client = Client { all, caller, subscriptions: BTreeMap::new() };
+        call.slot.closing.run_until_cancelled(client.run(socket, published, &call.slot)).await;
     })
 }
 
@@ -301,7 +301,6 @@ struct Client {
     all: All,
     caller: Caller,
     subscriptions: BTreeMap<u32, Subscription>,
-    in_progress: InProgress,
 }
 
 /// One client's subscription to one channel.
@@ -335,7 +334,7 @@ struct Wanted {
 
 impl Client {
     /// Sends what the client subscribes to until it disconnects or stalls.
-    async fn run(mut self, mut socket: WebSocket, mut published: watch::Receiver<u64>) {
+    async fn run(mut self, mut socket: WebSocket, mut published: watch::Receiver<u64>, slot: &ConnectionSlot) {
         let channels = self.channels().map(|(_, channel)| channel.advertisement());
         let advertise = json!({ "op": "advertise", "channels": channels.collect::<Vec<_>>() });
         let info = json!({ "op": "serverInfo", "name": "clearway", "capabilities": [] });
@@ -344,7 +343,7 @@ impl Client {
                 return;
             }
         }
-        let mut budget = Budget::new(FRAMES_MAX, FRAMES_PER_SECOND);
+        let mut frames = TokenBucket::new(FRAMES_MAX, FRAMES_PER_SECOND);
         loop {
             let answer = tokio::select! {
                 changed = published.changed() => {
@@ -352,7 +351,7 @@ impl Client {
                     None
                 }
                 received = socket.recv() => match received {
-                    Some(Ok(_)) if !budget.take() => return self.in_progress.place().close_for_flood("messages"),
+                    Some(Ok(_)) if !frames.take() => return slot.close("flood"),
                     Some(Ok(WsMessage::Text(text))) => self.apply(&text).err(),
                     // The library answers pings, and other messages have no meaning here.
                     Some(Ok(_)) => continue,

@@ -6,23 +6,24 @@ use std::time::Instant;
 
 use axum::Router;
 use axum::extract::ws::WebSocketUpgrade;
-use axum::extract::{Extension, Query, State};
-use axum::http::{HeaderMap, StatusCode, Uri, header};
+use axum::extract::{Extension, State};
+use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use rust_embed::RustEmbed;
 use serde_json::Value;
 
 use super::listen::access::Caller;
-use super::listen::{Listener, ListenerHandle, Place, READ_BUFFER_BYTES};
+use super::listen::{CallPermit, Listener, ListenerHandle, READ_BUFFER_BYTES};
 pub use super::page_live::Summaries;
 use super::page_live::{Live, MESSAGE_BYTES_MAX};
 use super::page_recorder::PageRecorder;
+use super::page_replay::PageReplay;
 use super::served::Vehicles;
 use crate::fleet::Fleet;
 use crate::player::ReplayHandle;
 use crate::record::writer::RecorderControl;
-use crate::status::{Format, prometheus, vehicle_json};
+use crate::status::{CONTENT_TYPE, prometheus, vehicle_json};
 
 #[derive(RustEmbed)]
 #[folder = "../web/"]
@@ -109,48 +110,26 @@ fn unavailable(text: String) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-async fn metrics(
-    State(shown): State<Shown>,
-    Extension(caller): Extension<Caller>,
-    headers: HeaderMap,
-) -> impl IntoResponse {
-    let accept = headers.get(header::ACCEPT).and_then(|accept| accept.to_str().ok()).unwrap_or_default();
-    let format = Format::accepted(accept);
-    let kind = [(header::CONTENT_TYPE, format.content_type())];
+async fn metrics(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
     let mut statuses = shown.vehicles.statuses();
     statuses.retain(|status| caller.may_reach(&status.name));
-    let listeners = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
-    (kind, prometheus(&statuses, listeners, format))
+    let listeners: Vec<_> = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
+    ([(header::CONTENT_TYPE, CONTENT_TYPE)], prometheus(&statuses, &listeners))
 }
 
-#[derive(serde::Deserialize)]
-struct LiveQuery {
-    vehicle: Option<String>,
-}
-
-/// The WebSocket: of all vehicles that the caller may reach, or of one, whose maps then begin at once.
+/// The WebSocket of all vehicles that the caller may reach.
 async fn live(
     State(shown): State<Shown>,
     Extension(caller): Extension<Caller>,
-    Extension(place): Extension<Arc<Place>>,
-    Query(query): Query<LiveQuery>,
+    Extension(call): Extension<Arc<CallPermit>>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    let live = match query.vehicle {
-        None => {
-            let recorder = shown.recorder.and_then(|control| PageRecorder::new(control, &caller));
-            Live::new(&shown.vehicles, shown.summaries, caller, shown.replay).with(shown.fleet, recorder)
-        }
-        Some(vehicle) => match shown.vehicles.find(&vehicle) {
-            Err(unknown) => return (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
-            Ok(served) => match Live::of_one(served, caller, shown.replay) {
-                Err(denied) => return (StatusCode::FORBIDDEN, format!("{}\n", denied.message())).into_response(),
-                Ok(live) => live,
-            },
-        },
-    };
-    let in_progress = place.begin_request();
+    let recorder = shown.recorder.and_then(|control| PageRecorder::new(control, &caller));
+    let replay = shown.replay.and_then(|handle| PageReplay::new(handle, &caller));
+    let live = Live::new(&shown.vehicles, shown.fleet, shown.summaries, caller, replay, recorder);
     let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX).max_frame_size(MESSAGE_BYTES_MAX);
     let upgrade = upgrade.read_buffer_size(READ_BUFFER_BYTES);
-    upgrade.on_upgrade(move |socket| live.serve(socket, in_progress))
+    upgrade.on_upgrade(async move |socket| {
+        call.slot.closing.run_until_cancelled(live.serve(socket, &call.slot)).await;
+    })
 }

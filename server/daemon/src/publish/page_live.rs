@@ -12,8 +12,7 @@
 //! | to the browser, text | `"watching"` (the maps after it are those of this `id`), `"refused"` (with `reason`), `"fleet"` (the status of each vehicle, once a second), `"replay"` (at each change), `"points"` (with `reason`: why there are none) |
 //!
 //! A selection means what it means over gRPC. With `max_in_flight`, no more maps than that are on the way, so a slow
-//! link has no backlog. A connection of one vehicle, `/live?vehicle=V`, begins with all its layers, and its status is a
-//! `status` message.
+//! link has no backlog.
 //!
 //! The server sends a ping once a second, and the status with the answer, which a browser gives by itself. While an
 //! answer is late nothing else is sent: a peer that does not read costs a ping. One that has not answered for
@@ -30,6 +29,8 @@ use bytes::Bytes;
 use clearway_proto::v1;
 use futures::Stream;
 use futures::channel::mpsc;
+use futures::future::BoxFuture;
+use futures::stream::FuturesUnordered;
 use prost::Message;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -38,15 +39,15 @@ use tokio_stream::{StreamExt, StreamMap};
 use tonic::{Code, Status};
 
 use super::grpc::reader::watch_from_page;
+use super::listen::ConnectionSlot;
 use super::listen::access::Caller;
-use super::listen::{Budget, InProgress};
 use super::page_points::{PagePoints, next_points};
-use super::page_recorder::{PageRecorder, RecorderRequest, recorder_answered};
-use super::page_replay::{PageReplay, PageRequest, replay_answered, replay_changed, replay_json};
+use super::page_recorder::{PageRecorder, RecorderRequest};
+use super::page_replay::{PageReplay, ReplayRequest, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::base::sync::locked;
+use crate::base::token_bucket::TokenBucket;
 use crate::fleet::Fleet;
-use crate::player::ReplayHandle;
 use crate::status::vehicle_json;
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
@@ -65,6 +66,8 @@ const REQUESTS_MAX: usize = 64;
 /// acknowledgements a second.
 const FRAMES_MAX: u32 = 4000;
 const FRAMES_PER_SECOND: u32 = 2000;
+/// Most requests of the replay and the recorder that wait for their answers. Ours: people press few buttons at once.
+const ANSWERS_MAX: usize = 16;
 /// Shortest time between two statuses that are sent at once because another vehicle's is wanted. Ours.
 const DETAIL_PERIOD: Duration = Duration::from_millis(200);
 /// Parts of the status that only the view of one vehicle shows.
@@ -80,7 +83,7 @@ enum Request {
     Keyframe { vehicle: String, id: u64 },
     Detail { vehicle: String },
     Points { vehicle: String, wanted: bool },
-    Replay(PageRequest),
+    Replay(ReplayRequest),
     Recorder(RecorderRequest),
 }
 
@@ -151,52 +154,26 @@ enum Next {
     End,
 }
 
-/// The short status of each vehicle as JSON, which all browsers share, with the time at which it was written.
+/// The short status of each vehicle as JSON, by its name and the run of its server, which all browsers share for half a
+/// second.
 #[derive(Clone, Debug, Default)]
-pub struct Summaries(Arc<Mutex<Written>>);
-
-#[derive(Debug, Default)]
-struct Written {
-    own: BTreeMap<String, Summary>,
-    /// Of the vehicles of other servers, with their names.
-    others: Option<(Instant, OtherSummaries)>,
-}
-
-type OtherSummaries = Arc<[(String, String)]>;
-
-type Summary = (Instant, Arc<str>);
+pub struct Summaries(Arc<Mutex<BTreeMap<(String, u64), (Instant, Arc<str>)>>>);
 
 impl Summaries {
-    fn of(&self, served: &Served) -> Arc<str> {
-        let mut all = locked(&self.0);
-        let kept = all.own.get(&*served.status.name).filter(|(written, _)| written.elapsed() < STATUS_PERIOD / 2);
-        if let Some((_, summary)) = kept {
-            return summary.clone();
-        }
-        let summary: Arc<str> = without_details(served.status.to_json()).to_string().into();
-        all.own.insert(served.status.name.to_string(), (Instant::now(), summary.clone()));
-        summary
-    }
-
-    fn of_others(&self, fleet: &Fleet) -> OtherSummaries {
-        let now = Instant::now();
-        let mut all = locked(&self.0);
-        let is_new = |(written, _): &&(Instant, OtherSummaries)| now.duration_since(*written) < STATUS_PERIOD / 2;
-        if let Some((_, kept)) = all.others.as_ref().filter(is_new) {
+    fn of(&self, vehicle: &str, boot_id: u64, status: impl FnOnce() -> Value) -> Arc<str> {
+        let (mut all, key) = (locked(&self.0), (vehicle.to_owned(), boot_id));
+        all.retain(|_, (written, _)| written.elapsed() < STATUS_PERIOD / 2);
+        if let Some((_, kept)) = all.get(&key) {
             return kept.clone();
         }
-        let summary = |of: &v1::Vehicle| (of.name.clone(), without_details(vehicle_json(of)).to_string());
-        let others: OtherSummaries = fleet.vehicles(now).iter().map(summary).collect();
-        all.others = Some((now, others.clone()));
-        others
+        let mut status = status();
+        if let Some(fields) = status.as_object_mut() {
+            DETAILS.iter().for_each(|part| _ = fields.remove(*part));
+        }
+        let summary: Arc<str> = status.to_string().into();
+        all.insert(key, (Instant::now(), summary.clone()));
+        summary
     }
-}
-
-fn without_details(mut status: Value) -> Value {
-    if let Some(fields) = status.as_object_mut() {
-        DETAILS.iter().for_each(|part| _ = fields.remove(*part));
-    }
-    status
 }
 
 /// One browser's connection.
@@ -205,12 +182,13 @@ pub(super) struct Live {
     /// The vehicles of other servers.
     fleet: Fleet,
     summaries: Summaries,
-    /// True for a connection of one vehicle.
-    is_of_one: bool,
     caller: Caller,
     replay: Option<PageReplay>,
     points: Option<PagePoints>,
     recorder: Option<PageRecorder>,
+    /// The answers to requests of the replay and the recorder: a step waits for its maps, which may wait for this
+    /// page's acknowledgement, and a disk may hang.
+    answers: FuturesUnordered<BoxFuture<'static, String>>,
     /// The vehicle whose whole status is sent.
     detail: String,
     /// When a status was last sent at once, because another vehicle's is wanted.
@@ -222,18 +200,24 @@ pub(super) struct Live {
 
 impl Live {
     /// A connection of all vehicles that the caller may reach.
-    pub fn new(vehicles: &Vehicles, summaries: Summaries, caller: Caller, replay: Option<ReplayHandle>) -> Self {
+    pub fn new(
+        vehicles: &Vehicles,
+        fleet: Fleet,
+        summaries: Summaries,
+        caller: Caller,
+        replay: Option<PageReplay>,
+        recorder: Option<PageRecorder>,
+    ) -> Self {
         let vehicles = vehicles.0.iter().filter(|served| caller.may_reach(&served.status.name)).cloned().collect();
-        let replay = replay.and_then(|handle| PageReplay::new(handle, &caller));
         Self {
             vehicles,
-            fleet: Fleet::default(),
+            fleet,
             summaries,
-            is_of_one: false,
             caller,
             replay,
             points: None,
-            recorder: None,
+            recorder,
+            answers: FuturesUnordered::new(),
             detail: String::new(),
             detailed: None,
             watching: BTreeMap::new(),
@@ -241,29 +225,9 @@ impl Live {
         }
     }
 
-    /// Adds the vehicles of other servers, and the recorder's buttons.
-    pub fn with(self, fleet: Fleet, recorder: Option<PageRecorder>) -> Self {
-        Self { fleet, recorder, ..self }
-    }
-
-    /// A connection of one vehicle, with all layers that the caller may read.
-    ///
-    /// # Errors
-    /// `PermissionDenied` if the caller may read none.
-    pub fn of_one(served: &Served, caller: Caller, replay: Option<ReplayHandle>) -> Result<Self, Status> {
-        let vehicle = served.status.name.to_string();
-        let all = Vehicles([served.clone()].into());
-        let mut live =
-            Self { is_of_one: true, detail: vehicle.clone(), ..Self::new(&all, Summaries::default(), caller, replay) };
-        // Refused here, before the connection is upgraded, a caller learns it from the response.
-        live.caller.layers(&vehicle, Vec::new(), &served.status.layers)?;
-        live.watch(WatchRequest { vehicle, ..WatchRequest::default() })?;
-        Ok(live)
-    }
-
     /// Sends maps and status until the browser disconnects or stalls, or the engines stop.
-    pub async fn serve(mut self, mut socket: WebSocket, in_progress: InProgress) {
-        let mut budget = Budget::new(FRAMES_MAX, FRAMES_PER_SECOND);
+    pub async fn serve(mut self, mut socket: WebSocket, slot: &ConnectionSlot) {
+        let mut frames = TokenBucket::new(FRAMES_MAX, FRAMES_PER_SECOND);
         let mut every = tokio::time::interval(STATUS_PERIOD);
         if let Some(recorder) = &self.recorder
             && socket.send(Frame::Text(recorder.state().into())).await.is_err()
@@ -280,11 +244,10 @@ impl Live {
                 _ = every.tick() => pings.next(),
                 points = next_points(&mut self.points), if may_send => Next::Frame(Frame::Binary(points)),
                 state = replay_changed(&mut replay_state), if may_send => text(replay_json(&state, "")),
-                answer = replay_answered(&mut self.replay) => text(answer),
-                answer = recorder_answered(&mut self.recorder) => text(answer),
+                Some(answer) = self.answers.next() => text(answer),
                 received = socket.recv() => match received {
-                    Some(Ok(_)) if !budget.take() => {
-                        in_progress.place().close_for_flood("messages");
+                    Some(Ok(_)) if !frames.take() => {
+                        slot.close("flood");
                         Next::End
                     }
                     Some(Ok(Frame::Text(text))) => self.apply(&text),
@@ -299,10 +262,7 @@ impl Live {
                 Next::Nothing => continue,
                 Next::End => break,
             };
-            match tokio::time::timeout(SEND_TIMEOUT, socket.send(frame)).await {
-                Ok(Ok(())) => {}
-                Ok(Err(_)) | Err(_) => break,
-            }
+            let Ok(Ok(())) = tokio::time::timeout(SEND_TIMEOUT, socket.send(frame)).await else { break };
         }
     }
 
@@ -325,35 +285,32 @@ impl Live {
         if !self.vehicles.is_empty() && self.vehicles.iter().all(|served| served.newest.has_changed().is_err()) {
             return Next::End;
         }
-        if let (true, [served]) = (self.is_of_one, &self.vehicles[..]) {
-            let mut status = served.status.to_json();
-            status["type"] = "status".into();
-            return text(status.to_string());
-        }
-        let statuses = self.vehicles.iter().map(|served| {
-            let is_detailed = *served.status.name == self.detail;
-            if is_detailed { served.status.to_json().to_string().into() } else { self.summaries.of(served) }
+        let own = self.vehicles.iter().map(|served| {
+            let status = &served.status;
+            match *status.name == self.detail {
+                true => status.to_json().to_string().into(),
+                false => self.summaries.of(&status.name, status.boot_id, || status.to_json()),
+            }
         });
-        let statuses: Vec<Arc<str>> = statuses.collect();
-        let others = self.summaries.of_others(&self.fleet);
-        let others = others.iter().filter(|(name, _)| self.caller.may_reach(name));
-        let others: Vec<&str> = others.map(|(_, summary)| &**summary).collect();
-        let (own, others) = (statuses.join(","), others.join(","));
+        let mut others = self.fleet.vehicles(Instant::now());
+        others.retain(|vehicle| self.caller.may_reach(&vehicle.name));
+        let others = others.iter().map(|of| self.summaries.of(&of.name, of.boot_id, || vehicle_json(of)));
+        let [own, others] = [own.collect::<Vec<_>>(), others.collect()].map(|all| all.join(","));
         text(format!(r#"{{"type":"fleet","vehicles":[{own}],"others":[{others}]}}"#))
     }
 
     fn apply(&mut self, message: &str) -> Next {
         match serde_json::from_str(message) {
             Err(error) => refused("", 0, &error.to_string()),
-            Ok(Request::Replay(request)) => match &mut self.replay {
-                Some(replay) => {
-                    replay.begin(&request);
-                    Next::Nothing
-                }
+            Ok(Request::Replay(_) | Request::Recorder(_)) if self.answers.len() >= ANSWERS_MAX => {
+                refused("", 0, &format!("{ANSWERS_MAX} requests are not answered yet, which are allowed"))
+            }
+            Ok(Request::Replay(request)) => match &self.replay {
+                Some(replay) => self.answer_later(replay.answer(&request)),
                 None => refused("", 0, "the server replays nothing that this reader may control"),
             },
-            Ok(Request::Recorder(request)) => match &mut self.recorder {
-                Some(recorder) => recorder.begin(request).map_or(Next::Nothing, text),
+            Ok(Request::Recorder(request)) => match &self.recorder {
+                Some(recorder) => self.answer_later(recorder.answer(request)),
                 None => refused("", 0, "the server records nothing that this reader may control"),
             },
             Ok(Request::Watch(request)) => {
@@ -398,6 +355,11 @@ impl Live {
                 }
             },
         }
+    }
+
+    fn answer_later(&self, answer: impl Future<Output = String> + Send + 'static) -> Next {
+        self.answers.push(Box::pin(answer));
+        Next::Nothing
     }
 
     fn served(&self, vehicle: &str) -> Result<&Served, Status> {

@@ -5,10 +5,6 @@
 //! the state after it, the files that were saved, and `error`. Operators get one without asking when they connect, so a
 //! page that has none shows no buttons.
 
-use std::pin::Pin;
-
-use futures::StreamExt;
-use futures::stream::FuturesUnordered;
 use serde::Deserialize;
 use serde_json::json;
 
@@ -16,11 +12,7 @@ use super::listen::access::Caller;
 use crate::record::writer::{Command, RecorderControl};
 
 /// The recorder as one page reaches it.
-pub(super) struct PageRecorder {
-    control: RecorderControl,
-    /// The request that the recorder has not answered yet: a disk may hang, and the maps go on meanwhile.
-    pending: FuturesUnordered<Pin<Box<dyn Future<Output = String> + Send>>>,
-}
+pub(super) struct PageRecorder(RecorderControl);
 
 /// A request of a button.
 #[derive(Clone, Copy, Debug, Deserialize)]
@@ -44,27 +36,24 @@ enum Button {
 impl PageRecorder {
     /// The recorder as an operator reaches it whom nothing limits; `None` for other callers.
     pub fn new(control: RecorderControl, caller: &Caller) -> Option<Self> {
-        caller.may_record().then(|| Self { control, pending: FuturesUnordered::new() })
+        caller.may_record().then_some(Self(control))
     }
 
     /// The state of the recorder.
     pub fn state(&self) -> String {
-        answer(&self.control, &[], "")
+        answer(&self.0, &[], "")
     }
 
-    /// Begins to carry out a request; returns why it does not.
-    pub fn begin(&mut self, request: RecorderRequest) -> Option<String> {
-        if !self.pending.is_empty() {
-            return Some(answer(&self.control, &[], "the recorder has not answered the last request yet"));
-        }
+    /// Carries out a request, and answers it.
+    pub fn answer(&self, request: RecorderRequest) -> impl Future<Output = String> + Send + use<> {
         let command = match request.command {
             Button::Start => Command::Start,
             Button::Stop => Command::Stop,
             Button::Split => Command::Split,
             Button::Save => Command::Save { seconds: request.seconds.into(), reason: "page".to_owned() },
         };
-        let control = self.control.clone();
-        self.pending.push(Box::pin(async move {
+        let control = self.0.clone();
+        async move {
             match control.send(command).await {
                 Ok(files) => {
                     let files: Vec<_> = files.iter().map(|file| file.display().to_string()).collect();
@@ -72,16 +61,7 @@ impl PageRecorder {
                 }
                 Err(error) => answer(&control, &[], &error.to_string()),
             }
-        }));
-        None
-    }
-}
-
-/// Waits for the answer to the pending request; for ever if there is none.
-pub(super) async fn recorder_answered(recorder: &mut Option<PageRecorder>) -> String {
-    match recorder {
-        Some(recorder) if !recorder.pending.is_empty() => recorder.pending.next().await.unwrap_or_default(),
-        _ => std::future::pending().await,
+        }
     }
 }
 

@@ -4,11 +4,7 @@
 //! of nanoseconds, because a browser's doubles cannot hold them, and the rate may be `"max"`. It is answered with the
 //! state after the change, or with `error`.
 
-use std::pin::Pin;
-
 use clearway_proto::v1;
-use futures::StreamExt;
-use futures::stream::FuturesUnordered;
 use serde::Deserialize;
 use serde_json::json;
 use tokio::sync::watch;
@@ -21,8 +17,6 @@ pub(super) struct PageReplay {
     pub handle: ReplayHandle,
     /// True if the client is an operator.
     may_control: bool,
-    /// Requests that are not answered yet: a step waits for its maps, which may wait for this page's acknowledgement.
-    pending: FuturesUnordered<Pin<Box<dyn Future<Output = String> + Send>>>,
 }
 
 impl PageReplay {
@@ -30,7 +24,7 @@ impl PageReplay {
     pub fn new(handle: ReplayHandle, caller: &Caller) -> Option<Self> {
         let reaches_all = handle.state().borrow().vehicles.iter().all(|vehicle| caller.may_reach(vehicle));
         let may_control = caller.is_operator();
-        reaches_all.then(|| Self { handle, may_control, pending: FuturesUnordered::new() })
+        reaches_all.then_some(Self { handle, may_control })
     }
 }
 
@@ -59,14 +53,14 @@ pub(super) fn replay_json(state: &v1::ReplayState, error: &str) -> String {
 }
 
 impl PageReplay {
-    /// Begins to carry out a request, which [`replay_answered`] answers with the state after it.
-    pub fn begin(&mut self, request: &PageRequest) {
+    /// Carries out a request, and answers it with the state after it.
+    pub fn answer(&self, request: &ReplayRequest) -> impl Future<Output = String> + Send + use<> {
         let request = match self.may_control {
             true => request.to_control(),
             false => Err("the role operator is needed to control the replay".to_owned()),
         };
         let handle = self.handle.clone();
-        self.pending.push(Box::pin(async move {
+        async move {
             let outcome = match request {
                 Err(error) => Err(error),
                 Ok(request) => handle.control(request).await.map_err(|error| error.to_string()),
@@ -75,22 +69,14 @@ impl PageReplay {
                 Ok(state) => replay_json(&state, ""),
                 Err(error) => replay_json(&handle.state().borrow(), &error),
             }
-        }));
-    }
-}
-
-/// Waits for the answer to a pending request; for ever if there is none.
-pub(super) async fn replay_answered(replay: &mut Option<PageReplay>) -> String {
-    match replay {
-        Some(replay) if !replay.pending.is_empty() => replay.pending.next().await.unwrap_or_default(),
-        _ => std::future::pending().await,
+        }
     }
 }
 
 /// A request of the time bar.
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct PageRequest {
+pub(super) struct ReplayRequest {
     seek_ns: Option<String>,
     rate: Option<serde_json::Value>,
     repeat: Option<bool>,
@@ -99,7 +85,7 @@ pub(super) struct PageRequest {
     step: Option<u32>,
 }
 
-impl PageRequest {
+impl ReplayRequest {
     fn to_control(&self) -> Result<v1::ReplayControl, String> {
         let seek_ns =
             self.seek_ns.as_ref().map(|text| text.parse().map_err(|_| format!("seek_ns {text:?}: no integer")));
@@ -128,10 +114,10 @@ mod tests {
     #[tokio::test]
     async fn a_step_that_waits_holds_up_no_request_after_it() {
         let (handle, mut input) = ReplayHandle::new(v1::ReplayState::default());
-        let mut page = Some(PageReplay { handle, may_control: true, pending: FuturesUnordered::new() });
-        for request in [r#"{"step":1}"#, r#"{"paused":true}"#] {
-            page.as_mut().unwrap().begin(&serde_json::from_str(request).unwrap());
-        }
+        let page = PageReplay { handle, may_control: true };
+        let [step, pause] =
+            [r#"{"step":1}"#, r#"{"paused":true}"#].map(|text| page.answer(&serde_json::from_str(text).unwrap()));
+        let mut step = tokio::spawn(step);
         let answers = async {
             let mut step = None;
             while let Some(Command::Change(request, outcome)) = input.commands.recv().await {
@@ -146,13 +132,15 @@ mod tests {
             }
             None
         };
-        let (answer, step) = tokio::join!(replay_answered(&mut page), answers);
-        assert!(answer.contains("\"jumps\":7") && step.is_some(), "{answer}");
+        let (answer, owed) = tokio::join!(pause, answers);
+        assert!(answer.contains("\"jumps\":7"), "{answer}");
+        assert!(futures::poll!(&mut step).is_pending());
+        drop(owed);
     }
 
     #[test]
     fn a_request_of_the_page_is_read_whole_or_refused() {
-        let request = |text: &str| serde_json::from_str::<PageRequest>(text).map_err(|e| e.to_string())?.to_control();
+        let request = |text: &str| serde_json::from_str::<ReplayRequest>(text).map_err(|e| e.to_string())?.to_control();
         let control = request(r#"{"seek_ns":"1700000000123456789","rate":"max","paused":true}"#).unwrap();
         assert_eq!((control.seek_ns, control.paused), (Some(1_700_000_000_123_456_789), Some(true)));
         assert_eq!(control.rate, Some(f64::INFINITY));

@@ -9,7 +9,7 @@ use crate::base::held_sockets::HeldSockets;
 use crate::config::Config;
 use crate::publish::foxglove;
 use crate::publish::listen::security::Security;
-use crate::publish::listen::{AllPlaces, Limits, Listener, ListenerHandle, Protocol};
+use crate::publish::listen::{AllSlots, Listener, ListenerHandle, ListenerLimits, Protocol};
 
 /// Most connections of Foxglove. Ours: some dozens of people with a few connections each.
 const FOXGLOVE_CONNECTIONS_MAX: usize = 256;
@@ -24,7 +24,7 @@ pub(super) struct Listeners {
     pub foxglove: Option<Listener>,
     pub security: Security,
     pub handles: Vec<(&'static str, ListenerHandle)>,
-    all: AllPlaces,
+    all: AllSlots,
 }
 
 impl Listeners {
@@ -33,7 +33,7 @@ impl Listeners {
     /// # Errors
     /// [`StartError::Listen`] with the first address that cannot be listened on.
     pub async fn bind(config: &Config, security: &Security, held: &mut HeldSockets) -> Result<Self, StartError> {
-        let (security, all) = (security.clone(), AllPlaces::default());
+        let (security, all) = (security.clone(), AllSlots::default());
         let mut listeners =
             Self { grpc: None, page: None, metrics: None, foxglove: None, security, handles: vec![], all };
         let (grpc, page, metrics, foxglove) = (&config.grpc, &config.page, &config.metrics, &config.foxglove);
@@ -70,21 +70,20 @@ impl Listeners {
             None => TcpListener::bind(at).await,
         };
         let socket = socket.map_err(|source| StartError::Listen { what: name, at, source })?;
-        let calls = (config.connections.calls_max, config.connections.calls_per_address_max);
         let (listener, handle) =
-            Listener::new(socket, protocol, limits(name, config), calls, self.security.clone(), &self.all);
+            Listener::new(socket, protocol, limits(name, config), self.security.clone(), &self.all);
         self.handles.push((name, handle));
         Ok(Some(listener))
     }
 }
 
 /// The limits of the listener with this name.
-pub(super) fn limits(name: &str, config: &Config) -> Limits {
+pub(super) fn limits(name: &str, config: &Config) -> ListenerLimits {
     let (connections_max, allowed_by) = match name {
         "grpc" => (config.grpc.connections_max, "grpc.connections_max"),
         "metrics" => (METRICS_CONNECTIONS_MAX, "the metrics' listener"),
         "page" => (config.page.connections_max, "page.connections_max"),
         _ => (FOXGLOVE_CONNECTIONS_MAX, "Foxglove's listener"),
     };
-    Limits::new(&config.connections, connections_max, allowed_by)
+    ListenerLimits { connections_max, allowed_by, every: config.connections.clone() }
 }

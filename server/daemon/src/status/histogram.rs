@@ -34,9 +34,14 @@ impl Histogram {
         self.counts.iter().sum()
     }
 
-    /// The upper bound of each bucket and the number of durations in it alone.
-    pub fn buckets(&self) -> Vec<(f64, u64)> {
-        BOUNDS_S.into_iter().chain([f64::INFINITY]).zip(self.counts).collect()
+    /// The upper bound of each bucket, in seconds, and the number of durations up to it.
+    pub fn up_to_bounds(&self) -> Vec<(f64, u64)> {
+        let mut sum = 0;
+        let sums = self.counts.map(|count| {
+            sum += count;
+            sum
+        });
+        BOUNDS_S.into_iter().chain([f64::INFINITY]).zip(sums).collect()
     }
 }
 
@@ -48,8 +53,8 @@ mod tests {
     fn a_duration_is_in_the_first_bucket_that_is_wide_enough() {
         let mut histogram = Histogram::default();
         [0.5, 1.0, 99.0, 70_000.0].iter().for_each(|ms| histogram.observe(Duration::from_secs_f64(ms / 1e3)));
-        let full: Vec<_> = histogram.buckets().into_iter().filter(|(_, count)| *count > 0).collect();
-        assert_eq!(full, [(0.0005, 1), (0.001, 1), (0.1, 1), (f64::INFINITY, 1)]);
+        let [below, first, .., last, all] = histogram.up_to_bounds()[..] else { panic!("there are buckets") };
+        assert_eq!([below, first, last, all], [(0.0005, 1), (0.001, 2), (60.0, 3), (f64::INFINITY, 4)]);
         assert_eq!((histogram.count(), histogram.sum_s()), (4, 70.1005));
     }
 }

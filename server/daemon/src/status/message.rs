@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use super::json::vehicle_json;
 use super::transports::Transport;
-use super::vehicle::{Snapshot, VehicleStatus};
+use super::vehicle::VehicleStatus;
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
 use crate::ingest::drops::UnknownSender;
@@ -18,11 +18,7 @@ use crate::ingest::drops::UnknownSender;
 impl VehicleStatus {
     /// The status as a message of the wire.
     pub fn to_proto(&self) -> v1::Vehicle {
-        self.proto_of(&self.snapshot())
-    }
-
-    fn proto_of(&self, snapshot: &Snapshot) -> v1::Vehicle {
-        let assessment = self.assess();
+        let (snapshot, assessment) = (self.snapshot(), self.assess());
         let (sensors, pose, validity) = {
             let changing = locked(&self.changing);
             (changing.states.clone(), changing.pose, changing.validity)
@@ -63,11 +59,10 @@ impl VehicleStatus {
         }
     }
 
-    /// The status as JSON: the content of [`VehicleStatus::to_proto`], and rates of the newest maps. 64-bit numbers
-    /// that a browser's doubles cannot hold (boot id, stamps) are strings.
+    /// The status as JSON: the content of [`VehicleStatus::to_proto`]. 64-bit numbers that a browser's doubles cannot
+    /// hold (boot id, stamps) are strings.
     pub fn to_json(&self) -> Value {
-        let snapshot = self.snapshot();
-        let proto = self.proto_of(&snapshot);
+        let proto = self.to_proto();
         let unknown_senders = proto.unknown_senders.iter();
         let unknown_senders = unknown_senders.map(|sender| {
             json!({
@@ -80,7 +75,6 @@ impl VehicleStatus {
         document["now_ns"] = now_ns().to_string().into();
         document["recorder"]["stopped"] = self.recorder.get().and_then(|counts| counts.stop_reason()).into();
         document["unknown_senders"] = unknown_senders.collect();
-        document["rates"] = json!({ "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz });
         document["alive"] = self.is_alive().into();
         document
     }

@@ -13,9 +13,9 @@
 //! | `json` | a vehicle's and a sensor's state and counts -> JSON |
 //! | `notices` | changes of the sensors -> the log, each once |
 //! | `reasons` | the reasons for which metrics exist before they occur |
-//! | `text_format` | OpenMetrics -> Prometheus' text format |
+//! | `text_format` | metrics -> Prometheus' text format |
 //! | `process` | `/proc` -> memory, files and time of this process |
-//! | `metrics` | the status of all vehicles, listeners and process -> OpenMetrics or Prometheus' text format |
+//! | `metrics` | the status of all vehicles, listeners and process -> metrics |
 
 pub mod assess;
 pub mod health;
@@ -36,8 +36,8 @@ pub mod window;
 pub use assess::{state_changed, watch_states};
 pub use health::State;
 pub use json::{recorder_json, run_text, sensor_json, vehicle_json};
-pub use metrics::prometheus;
-pub use text_format::Format;
+pub use metrics::{ListenerCounts, prometheus};
+pub use text_format::CONTENT_TYPE;
 pub use transports::{Reader, Transport};
 pub(crate) use vehicle::MadeMap;
 pub use vehicle::{Snapshot, VehicleStatus};

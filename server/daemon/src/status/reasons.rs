@@ -52,7 +52,7 @@ pub const CLOSE_REASONS: [&str; 14] = [
     "made_room",
     "no_request",
     "over_limit",
-    "over_limit_timeout",
+    "role_lost",
     "stalled",
     "streams",
 ];

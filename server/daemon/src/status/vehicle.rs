@@ -34,16 +34,12 @@ use super::window::{PacketCounts, STAGES, StageTimes, Window};
 
 /// Latencies kept for the percentiles: seven minutes of a 10 Hz sensor.
 const LATENCIES: usize = 4096;
-/// Maps over which the rates are measured.
-const RATE_MAPS: usize = 16;
 /// Longest time between two signs of life of an engine that does not hang. Ours: the largest allowed scan takes half a
 /// second, and an engine without events polls fifty times a second.
 const ENGINE_SILENT_MAX: Duration = Duration::from_secs(2);
 /// Most other servers that are remembered, and the longest name of one. Ours: people read them.
 pub(super) const CLAIMS_MAX: usize = 8;
 pub(super) const SERVER_NAME_MAX: usize = 64;
-/// Time without a new map after which the rates are 0.
-const RATE_AGE_MAX: Duration = Duration::from_secs(2);
 
 /// Status of one vehicle, written by its engine and read by every publisher.
 #[derive(Debug)]
@@ -120,8 +116,6 @@ pub(super) struct Changing {
     pub(super) ages: Histogram,
     /// Time to step and encode each of the newest maps, in ns.
     latencies_ns: VecDeque<u64>,
-    /// Publication of each of the newest maps, and the datagrams received until then.
-    paces: VecDeque<(Instant, u64)>,
 }
 
 /// The newest signs of life of a sensor, after the start of the server.
@@ -172,10 +166,6 @@ pub struct Snapshot {
     pub latency_ms_p50: Option<f64>,
     /// 99th percentile of that time.
     pub latency_ms_p99: Option<f64>,
-    /// Maps per second, over the newest maps.
-    pub maps_hz: f64,
-    /// Datagrams per second, over the newest maps.
-    pub packets_hz: f64,
     /// Median time by stage over the maps of the last 10 s.
     pub latency_ms: BTreeMap<&'static str, f64>,
     /// Maps per second over the last 10 s.
@@ -407,18 +397,12 @@ impl VehicleStatus {
             state.latencies_ns.pop_front();
         }
         state.latencies_ns.push_back(u64::try_from(latency.as_nanos()).unwrap_or(u64::MAX));
-        if state.paces.len() == RATE_MAPS {
-            state.paces.pop_front();
-        }
-        let received = state.ledger.received;
-        state.paces.push_back((Instant::now(), received));
     }
 
     /// The current status.
     pub fn snapshot(&self) -> Snapshot {
         let state = locked(&self.changing);
         let mut latencies: Vec<u64> = state.latencies_ns.iter().copied().collect();
-        let (maps_hz, packets_hz) = rates(&state.paces);
         let now = self.started.elapsed();
         let mut snapshot = Snapshot {
             ledger: state.ledger.clone(),
@@ -427,8 +411,6 @@ impl VehicleStatus {
             maps: state.maps,
             newest_capture_end_ns: state.newest_capture_end_ns,
             drivable_share: state.drivable_share,
-            maps_hz,
-            packets_hz,
             latency_ms: state.window.latency_ms(now),
             map_rate_hz: state.window.map_rate_hz(now),
             map_bytes: state.window.map_bytes(now),
@@ -467,16 +449,6 @@ pub(super) fn packet_counts(sensors: &[NamedStatus]) -> PacketCounts {
         missing: sum(|sensor| sensor.status.packets_lost),
         dropped: sum(|sensor| sensor.ledger.refused_sum() + sensor.ledger.lost + sensor.ledger.kernel_drops),
     }
-}
-
-/// Maps and datagrams per second.
-fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
-    let (Some((first, before)), Some((last, after))) = (paces.front(), paces.back()) else { return (0.0, 0.0) };
-    let seconds = (*last - *first).as_secs_f64();
-    if paces.len() < 2 || seconds <= 0.0 || last.elapsed() > RATE_AGE_MAX {
-        return (0.0, 0.0);
-    }
-    ((paces.len() - 1) as f64 / seconds, after.saturating_sub(*before) as f64 / seconds)
 }
 
 /// Nearest-rank percentile of ascending durations.

@@ -68,11 +68,9 @@ pub async fn serve<I: IngestService>(
     if replay.is_some() {
         health.set_serving::<ReplayServiceServer<Replay>>().await;
     }
-    let reflection = || {
-        tonic_reflection::server::Builder::configure()
-            .register_encoded_file_descriptor_set(DESCRIPTORS)
-            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-    };
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(DESCRIPTORS)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET);
     let mut routes = Routes::builder();
     routes.add_service(MapServiceServer::new(Maps { vehicles, fleet }).max_decoding_message_size(REQUEST_BYTES_MAX));
     let recordings = RecordingServiceServer::new(Recordings { control: recorder.clone() });
@@ -83,8 +81,7 @@ pub async fn serve<I: IngestService>(
     if let Some(replay) = replay {
         routes.add_service(replay);
     }
-    // Older versions of grpcurl know only the older version of reflection.
-    routes.add_service(health_service).add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?);
+    routes.add_service(health_service).add_service(reflection.build_v1()?);
     let reports = report_health(health, of_health, recorder);
     tokio::select! {
         () = listener.serve(routes.routes().prepare().into_axum_router(), stop) => {}

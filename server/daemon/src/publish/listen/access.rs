@@ -51,7 +51,6 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/grpc.health.v1.Health/Check", &[Role::Reader, Role::Ingester]),
     ("/grpc.health.v1.Health/Watch", &[Role::Reader, Role::Ingester]),
     ("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
-    ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
 ];
 
 /// How the RPCs of the recorder begin.
@@ -243,12 +242,7 @@ mod tests {
     #[test]
     fn the_list_of_rpcs_is_that_of_the_wire_contract() {
         let mut rpcs = BTreeSet::new();
-        let sets = [
-            DESCRIPTORS,
-            tonic_health::pb::FILE_DESCRIPTOR_SET,
-            tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET,
-            tonic_reflection::pb::v1alpha::FILE_DESCRIPTOR_SET,
-        ];
+        let sets = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET];
         for set in sets {
             for file in FileDescriptorSet::decode(set).unwrap().file {
                 for service in &file.service {

@@ -1,62 +1,56 @@
 //! The one path by which every TCP listener accepts: gRPC, the page, the metrics and Foxglove.
 //!
-//! A connection gets a place (or an error that says why not), shows its certificate, and then its requests are checked
-//! and answered. What it may cost is limited in number, time and bytes.
+//! A connection gets a slot (or an error that says why not), shows its certificate, and then its requests are checked
+//! and answered. Connections and calls are limited in number, the time until the first request and the bytes that wait
+//! for a peer too.
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | `places` | connections -> those that may stay: limits in all and of one address, idle and stalled ones closed |
-//! | `flow` | responses -> their bytes while they wait, limited |
-//! | `body` | the body of a response -> pieces for the transport, counted |
-//! | `connection` | a socket, plain or encrypted -> bytes, in turn with others, until its place is closed |
-//! | `frames` | the bytes of an HTTP/2 client -> its frames without data, limited by a `budget` |
+//! | `slots` | peers -> connections and calls within the limits, in all and of one address; idle ones closed |
 //! | `tls` | certificates -> TLS, names of clients |
 //! | [`access`] | names -> roles -> RPCs and paths, vehicles and layers |
 //! | [`security`] | certificates, roles and tokens that hold at present |
 //! | `web` | a browser's request -> who may ask, by which host, from which origin; headers |
 
 pub mod access;
-mod body;
-mod budget;
-mod connection;
-mod flow;
-mod frames;
-mod places;
 pub mod security;
+mod slots;
 mod tls;
 mod web;
 
-use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::error::Error;
 use std::future::poll_fn;
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use axum::Router;
 use axum::body::Body;
 use axum::http::{Request, Response, StatusCode};
 use axum::response::IntoResponse;
+use http_body_util::BodyExt;
 use hyper::body::Incoming;
 use hyper::server::conn::{http1, http2};
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use socket2::SockRef;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
+use tokio_rustls::server::TlsStream;
+use tokio_util::either::Either;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use tower_service::Service;
 
+use crate::base::sync::locked;
+use crate::status::ListenerCounts;
 use access::Caller;
-use body::CountedBody;
-pub use budget::Budget;
-use connection::{Connection, Transport};
-use flow::Flows;
-use places::{Grant, Places};
 use security::Security;
+use slots::{Authorization, ConnectionSlots};
 
-pub use places::{AllPlaces, InProgress, Limits, Place};
+pub use slots::{CallPermit, ConnectionSlot, ListenerLimits};
 
 /// Pause after an error of the listener itself, such as no free file handle: to try again at once would only use a
 /// core.
@@ -100,75 +94,72 @@ pub enum Protocol {
     Web(&'static [&'static str]),
 }
 
+/// The connection slots of all listeners of a server, which share its file handles.
+pub type AllSlots = Arc<Mutex<Vec<Arc<ConnectionSlots>>>>;
+
 /// A TCP listener with its limits and its security.
 pub struct Listener {
     socket: TcpListener,
     shared: Shared,
-    all: AllPlaces,
+    all: AllSlots,
 }
 
 /// What the connections of a listener share.
 #[derive(Clone)]
 struct Shared {
     protocol: Protocol,
-    places: Arc<Places>,
+    slots: Arc<ConnectionSlots>,
     security: Security,
 }
 
-/// Number of open connections, bytes that wait for readers, and connections refused or closed, by reason.
-pub type Counts = (usize, usize, BTreeMap<&'static str, u64>);
-
 /// The counts of one listener, and its limits, which can be replaced.
 #[derive(Clone)]
-pub struct ListenerHandle(Arc<Places>, Arc<Flows>, Protocol);
+pub struct ListenerHandle(Shared);
 
 impl ListenerHandle {
     /// The counts at present.
-    pub fn counts(&self) -> Counts {
-        let (open, closed) = self.0.counts();
-        (open, self.1.bytes(), closed)
+    pub fn counts(&self) -> ListenerCounts {
+        let (open, closed) = self.0.slots.counts();
+        ListenerCounts { open, closed }
     }
 
     /// Uses other limits from now on; open connections stay.
-    pub fn set_limits(&self, limits: Limits) {
-        self.0.set_limits(limits);
+    pub fn set_limits(&self, limits: ListenerLimits) {
+        self.0.slots.set_limits(limits);
     }
 
     /// Closes the connections whose clients have lost their role, or may reach other vehicles or layers than when their
-    /// request began.
+    /// call began.
     pub fn recheck(&self, current: &security::Current) {
         let Some(access) = &current.access else { return };
-        self.0.recheck(|grant| {
-            let allowed = match self.2 {
-                Protocol::Grpc => access.check(&grant.path, &grant.names),
-                Protocol::Web(_) => access.check_path(&grant.path, &grant.names),
+        self.0.slots.recheck(|call| {
+            let allowed = match self.0.protocol {
+                Protocol::Grpc => access.check(&call.path, &call.names),
+                Protocol::Web(_) => access.check_path(&call.path, &call.names),
             };
-            allowed.is_ok_and(|caller| caller == grant.caller)
+            allowed.is_ok_and(|caller| caller == call.caller)
         });
     }
 
     /// How long the listener has given no sign of life; it gives one twice a second. `None` before its first.
     pub fn silent(&self) -> Option<Duration> {
-        self.0.silent()
+        self.0.slots.silent()
     }
 }
 
 impl Listener {
-    /// A listener with these limits; at most so many responses at once, in all and for one address. It shares file
-    /// handles with those of `all`.
+    /// A listener with these limits. It shares file handles with the listeners of `all`.
     pub fn new(
         socket: TcpListener,
         protocol: Protocol,
-        limits: Limits,
-        calls: (usize, usize),
+        limits: ListenerLimits,
         security: Security,
-        all: &AllPlaces,
+        all: &AllSlots,
     ) -> (Self, ListenerHandle) {
-        let flows = Flows::new(calls.0, calls.1, limits.kept);
-        let places = Places::new(limits, flows.clone());
-        let shared = Shared { protocol, places: places.clone(), security };
-        all.add(places.clone());
-        (Self { socket, shared, all: all.clone() }, ListenerHandle(places, flows, protocol))
+        let slots = ConnectionSlots::new(limits);
+        locked(all).push(slots.clone());
+        let shared = Shared { protocol, slots, security };
+        (Self { socket, shared: shared.clone(), all: all.clone() }, ListenerHandle(shared))
     }
 
     /// The address it listens on.
@@ -187,8 +178,7 @@ impl Listener {
             let accepted = tokio::select! {
                 () = &mut stop => break,
                 _ = sweep.tick() => {
-                    shared.places.beat();
-                    shared.places.sweep();
+                    shared.slots.sweep();
                     continue;
                 }
                 Some(_) = connections.join_next() => continue,
@@ -196,14 +186,15 @@ impl Listener {
             };
             match accepted {
                 Ok((stream, peer)) => {
-                    let place = Arc::new(shared.places.admit(peer.ip().to_canonical()));
-                    let run = shared.clone().run(stream, place, router.clone(), stopping.clone());
-                    connections.spawn(run);
+                    let slot = Arc::new(shared.slots.admit(peer.ip().to_canonical()));
+                    let (closing, router) = (slot.closing.clone(), router.clone());
+                    let served = shared.clone().serve(stream, slot, router, stopping.clone());
+                    connections.spawn(async move { closing.run_until_cancelled_owned(served).await });
                 }
                 Err(error) => {
-                    shared.places.count("accept_error");
+                    shared.slots.count("accept_error");
                     // There may be no free file handle.
-                    let freed = all.free(FREED_MAX);
+                    let freed: usize = locked(&all).iter().map(|slots| slots.free(FREED_MAX)).sum();
                     tracing::warn!(%error, freed, "accept");
                     tokio::time::sleep(if freed > 0 { FREED_PAUSE } else { ACCEPT_PAUSE }).await;
                 }
@@ -217,151 +208,138 @@ impl Listener {
 
 impl Shared {
     /// Answers the requests of one connection.
-    async fn run(self, stream: TcpStream, place: Arc<Place>, router: Router, stopping: CancellationToken) {
+    async fn serve(self, stream: TcpStream, slot: Arc<ConnectionSlot>, router: Router, stopping: CancellationToken) {
         // A failure leaves the default, which is slower but right.
         let _ = stream.set_nodelay(true);
-        let Some((transport, names)) = self.secure(stream, &place).await else { return };
-        let is_http2 = self.protocol == Protocol::Grpc;
-        let io = TokioIo::new(Connection::new(transport, place.clone(), is_http2));
-        let (protocol, names, of) = (self.protocol, Arc::new(names), place.clone());
+        // The kernel ends a connection whose peer takes no byte of what waits for it.
+        let _ = SockRef::from(&stream).set_tcp_user_timeout(Some(self.slots.stalled_max()));
+        let Some((stream, names)) = self.secure(stream, &slot).await else { return };
+        let (protocol, names, of) = (self.protocol, Arc::new(names), slot.clone());
         let service =
-            service_fn(move |request| self.clone().answer(request, place.clone(), names.clone(), router.clone()));
-        // An error ends this connection alone, and the peer knows it better.
-        match protocol {
+            service_fn(move |request| self.clone().answer(request, slot.clone(), names.clone(), router.clone()));
+        let io = TokioIo::new(stream);
+        let ended = match protocol {
             Protocol::Grpc => {
                 let connection = http2().serve_connection(io, service);
-                tokio::pin!(connection);
-                let ended = tokio::select! {
-                    ended = connection.as_mut() => ended,
-                    () = stopping.cancelled() => {
-                        connection.as_mut().graceful_shutdown();
-                        connection.await
-                    }
-                };
-                if let Some(reason) = ended.err().as_ref().and_then(breach) {
-                    of.close_for_breach(reason);
-                }
+                until_stopped(connection, http2::Connection::graceful_shutdown, stopping).await
             }
             Protocol::Web(_) => {
                 let connection = http1().serve_connection(io, service).with_upgrades();
-                tokio::pin!(connection);
-                tokio::select! {
-                    _ = connection.as_mut() => return,
-                    () = stopping.cancelled() => connection.as_mut().graceful_shutdown(),
-                }
-                let _ = connection.await;
+                until_stopped(connection, http1::UpgradeableConnection::graceful_shutdown, stopping).await
             }
+        };
+        // An error ends this connection alone.
+        if let Some(reason) = ended.err().as_ref().and_then(reason_of) {
+            of.close(reason);
         }
     }
 
     /// The TLS handshake, if there are certificates; the names in the client's certificate.
-    async fn secure(&self, stream: TcpStream, place: &Place) -> Option<(Transport, Vec<String>)> {
+    async fn secure(
+        &self,
+        stream: TcpStream,
+        slot: &ConnectionSlot,
+    ) -> Option<(Either<TcpStream, TlsStream<TcpStream>>, Vec<String>)> {
         let current = self.security.current();
-        let Some(tls) = &current.tls else { return Some((Transport::Plain(stream), Vec::new())) };
+        let Some(tls) = &current.tls else { return Some((Either::Left(stream), Vec::new())) };
         let acceptor = if self.protocol == Protocol::Grpc { &tls.grpc } else { &tls.web };
-        let closing = place.closing();
-        let stream = tokio::select! {
-            () = closing.cancelled() => return None,
-            shaken = tokio::time::timeout(HANDSHAKE_TIMEOUT, acceptor.accept(stream)) => match shaken {
-                Ok(Ok(stream)) => stream,
-                Ok(Err(error)) => {
-                    tracing::info!(peer = %place.peer(), %error, "TLS handshake");
-                    place.count("handshake");
-                    return None;
-                }
-                Err(_) => {
-                    place.count("handshake_timeout");
-                    return None;
-                }
-            },
+        let stream = match tokio::time::timeout(HANDSHAKE_TIMEOUT, acceptor.accept(stream)).await {
+            Ok(Ok(stream)) => stream,
+            Ok(Err(error)) => {
+                tracing::info!(peer = %slot.peer, %error, "TLS handshake");
+                slot.count("handshake");
+                return None;
+            }
+            Err(_) => {
+                slot.count("handshake_timeout");
+                return None;
+            }
         };
         let certificate = stream.get_ref().1.peer_certificates().and_then(|chain| chain.first());
         let names = certificate.map(|certificate| tls::names(certificate)).unwrap_or_default();
         if current.access.as_ref().is_some_and(|access| access.knows(&names)) {
-            place.set_known();
+            slot.set_known();
         }
-        Some((Transport::Tls(Box::new(stream)), names))
+        Some((Either::Right(stream), names))
     }
 
     /// Checks a request and answers it.
     async fn answer(
         self,
         request: Request<Incoming>,
-        place: Arc<Place>,
+        slot: Arc<ConnectionSlot>,
         names: Arc<Vec<String>>,
         mut router: Router,
-    ) -> Result<Response<CountedBody>, Infallible> {
-        let in_progress = place.begin_request();
+    ) -> Result<Response<Body>, Infallible> {
         let mut request = request.map(Body::new);
-        let mut grant = None;
-        let (mut response, flow) = match self.check(&request, &place, &names) {
-            Ok((caller, names)) => match place.begin_flow() {
-                None => (self.refuse_call(&place), None),
-                flow => {
-                    let path = request.uri().path().to_owned();
-                    grant = Some(place.grant(Grant { path, names, caller: caller.clone() }));
-                    request.extensions_mut().insert(caller);
-                    request.extensions_mut().insert(place);
-                    let Ok(()) = poll_fn(|context| Service::<Request<Body>>::poll_ready(&mut router, context)).await;
-                    let Ok(response) = router.call(request).await;
-                    (response, flow)
-                }
-            },
-            Err(refusal) => (*refusal, None),
+        let mut response = match self.begin(&request, &slot, &names) {
+            Ok((caller, call)) => {
+                let call = Arc::new(call);
+                request.extensions_mut().insert(caller);
+                request.extensions_mut().insert(call.clone());
+                let Ok(()) = poll_fn(|context| Service::<Request<Body>>::poll_ready(&mut router, context)).await;
+                let Ok(response) = router.call(request).await;
+                // The call is in progress until its response ends.
+                response.map(|body| {
+                    Body::new(body.map_frame(move |frame| {
+                        let _in_progress = &call;
+                        frame
+                    }))
+                })
+            }
+            Err(refusal) => *refusal,
         };
         if self.protocol != Protocol::Grpc {
             web::protect(&mut response);
         }
-        Ok(response.map(|body| CountedBody::new(body, in_progress, flow, grant)))
+        Ok(response)
+    }
+
+    /// Checks a request and begins its call.
+    fn begin(
+        &self,
+        request: &Request<Body>,
+        slot: &Arc<ConnectionSlot>,
+        names: &[String],
+    ) -> Result<(Caller, CallPermit), Box<Response<Body>>> {
+        let full = |reason, text| {
+            slot.count(reason);
+            Box::new(self.refuse(StatusCode::SERVICE_UNAVAILABLE, Status::resource_exhausted(text)))
+        };
+        slot.begin_request().map_err(|text| full("over_limit", text))?;
+        let (caller, names) = self.check(request, slot, names).inspect_err(|refusal| {
+            if !refusal.status().is_redirection() {
+                tracing::info!(peer = %slot.peer, status = %refusal.status(), "denied");
+                slot.count("denied");
+            }
+        })?;
+        let path = request.uri().path().to_owned();
+        let call = slot.begin_call(Authorization { path, names, caller: caller.clone() }).ok_or_else(|| {
+            let text = "too many calls are in progress: connections.calls_max, of which connections.kept are for known \
+                        peers, and connections.calls_per_address_max limit those of all clients and those of";
+            full("calls", format!("{text} {}", slot.peer))
+        })?;
+        Ok((caller, call))
     }
 
     /// What the client of a request may reach, and its names.
     fn check(
         &self,
         request: &Request<Body>,
-        place: &Place,
+        slot: &ConnectionSlot,
         names: &[String],
     ) -> Result<(Caller, Vec<String>), Box<Response<Body>>> {
-        if let Some(text) = place.over_limit() {
-            place.count("over_limit");
-            return Err(Box::new(self.refuse(StatusCode::SERVICE_UNAVAILABLE, Status::resource_exhausted(text))));
-        }
         let current = self.security.current();
-        match self.protocol {
-            Protocol::Grpc => {
-                let Some(access) = &current.access else { return Ok((Caller::unlimited(), Vec::new())) };
-                access.check(request.uri().path(), names).map(|caller| (caller, names.to_vec())).map_err(|status| {
-                    tracing::info!(peer = %place.peer(), status = status.message(), "denied");
-                    place.count("denied");
-                    Box::new(status.into_http())
-                })
-            }
-            Protocol::Web(origins) => match web::check(request, &current, origins, names) {
-                Ok((caller, names)) => {
-                    if current.access.as_ref().is_some_and(|access| access.knows(&names)) {
-                        place.set_known();
-                    }
-                    Ok((caller, names))
-                }
-                Err(refusal) => {
-                    if !refusal.status().is_redirection() {
-                        tracing::info!(peer = %place.peer(), status = %refusal.status(), "denied");
-                        place.count("denied");
-                    }
-                    Err(refusal)
-                }
-            },
+        let Protocol::Web(origins) = self.protocol else {
+            let Some(access) = &current.access else { return Ok((Caller::unlimited(), Vec::new())) };
+            let caller = access.check(request.uri().path(), names).map_err(|status| Box::new(status.into_http()))?;
+            return Ok((caller, names.to_vec()));
+        };
+        let (caller, names) = web::check(request, &current, origins, names)?;
+        if current.access.as_ref().is_some_and(|access| access.knows(&names)) {
+            slot.set_known();
         }
-    }
-
-    fn refuse_call(&self, place: &Place) -> Response<Body> {
-        place.count("calls");
-        let text = format!(
-            "too many calls are in progress: connections.calls_max, of which connections.kept are for known peers, and \
-             connections.calls_per_address_max limit those of all clients and those of {}",
-            place.peer()
-        );
-        self.refuse(StatusCode::SERVICE_UNAVAILABLE, Status::resource_exhausted(text))
+        Ok((caller, names))
     }
 
     fn refuse(&self, code: StatusCode, status: Status) -> Response<Body> {
@@ -372,10 +350,28 @@ impl Shared {
     }
 }
 
-/// Why the library has ended a connection of HTTP/2, if the client breached the protocol or the library's limits.
-fn breach(error: &hyper::Error) -> Option<h2::Reason> {
-    let of_library = error.source().and_then(|source| source.downcast_ref::<h2::Error>());
-    of_library.filter(|error| error.is_library()).and_then(h2::Error::reason)
+/// Serves a connection until it ends; once `stopping`, until its calls have ended.
+async fn until_stopped<C: Future>(connection: C, shutdown: fn(Pin<&mut C>), stopping: CancellationToken) -> C::Output {
+    tokio::pin!(connection);
+    tokio::select! {
+        ended = connection.as_mut() => return ended,
+        () = stopping.cancelled() => shutdown(connection.as_mut()),
+    }
+    connection.await
+}
+
+/// The reason for which the library or the kernel has ended a connection, if the client breached the protocol or a
+/// limit.
+fn reason_of(error: &hyper::Error) -> Option<&'static str> {
+    let source = error.source()?;
+    let http2 = source.downcast_ref::<h2::Error>();
+    match http2.filter(|error| error.is_library()).and_then(h2::Error::reason) {
+        Some(h2::Reason::ENHANCE_YOUR_CALM) => return Some("flood"),
+        Some(_) => return Some("http2"),
+        None => {}
+    }
+    let io = source.downcast_ref::<std::io::Error>().or_else(|| http2.and_then(h2::Error::get_io));
+    io.is_some_and(|error| error.kind() == std::io::ErrorKind::TimedOut).then_some("stalled")
 }
 
 fn http2() -> http2::Builder<TokioExecutor> {
