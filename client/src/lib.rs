@@ -67,3 +67,8 @@ pub use zenoh::ZenohClient;
 #[cfg(doctest)]
 #[doc = include_str!("../../README.md")]
 struct Readme;
+
+/// Compiles the code blocks of the planners' guide.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Guide;

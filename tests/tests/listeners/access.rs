@@ -1,4 +1,4 @@
-//! Who may do what, on every listener: each call and key against each kind of client. The table stands in SECURITY.md,
+//! Who may do what, on every listener: each call and key against each kind of client. The table stands in deploy/ACCESS.md,
 //! and this test holds it equal to what a server with certificates and roles does.
 //!
 //! A new row is one line in [`rows`]. `CLEARWAY_BLESS=1 cargo test --test system access` writes the table.
@@ -26,7 +26,7 @@ use zenoh::sample::{Locality, Sample, SampleKind, SourceInfo};
 use crate::fixture::certificates::{TOKEN, certificates, start, with_roles, zenoh_file};
 use crate::fixture::{Driving, https, until, within};
 
-const SECURITY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../SECURITY.md");
+const TABLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/ACCESS.md");
 const BEGIN: &str = "<!-- The table is written by tests/tests/listeners/access.rs. -->\n";
 const END: &str = "<!-- End of the table. -->";
 
@@ -386,7 +386,7 @@ fn read(table: &str) -> BTreeMap<String, Vec<bool>> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn the_access_table_of_security_md_is_what_the_server_does() {
-    let text = std::fs::read_to_string(SECURITY).unwrap();
+    let text = std::fs::read_to_string(TABLE).unwrap();
     let (before, rest) = text.split_once(BEGIN).expect("the mark before the table");
     let (golden, after) = rest.split_once(END).expect("the mark after the table");
     let folder = tempfile::tempdir().unwrap();
@@ -403,8 +403,8 @@ async fn the_access_table_of_security_md_is_what_the_server_does() {
     within("shutdown", bed.running.shutdown()).await.unwrap();
     let measured = table(&found);
     if is_blessed() {
-        std::fs::write(SECURITY, format!("{before}{BEGIN}{measured}{END}{after}")).unwrap();
+        std::fs::write(TABLE, format!("{before}{BEGIN}{measured}{END}{after}")).unwrap();
     } else {
-        assert_eq!(golden, measured, "CLEARWAY_BLESS=1 writes the measured table into SECURITY.md");
+        assert_eq!(golden, measured, "CLEARWAY_BLESS=1 writes the measured table into deploy/ACCESS.md");
     }
 }

@@ -1,4 +1,4 @@
-//! The tests of a planner that the README shows, in Rust, Python and a shell, as they are written there.
+//! The tests of a planner that client/README.md shows, in Rust, Python and a shell, as they are written there.
 
 use std::fs;
 use std::path::Path;
@@ -90,7 +90,7 @@ async fn a_reader_over_zenoh_learns_that_a_replay_has_ended_and_why_one_in_locks
 
 /// The code blocks of the README's section, by language.
 fn blocks(language: &str) -> Vec<String> {
-    let readme = fs::read_to_string(workspace().join("README.md")).expect("README.md");
+    let readme = fs::read_to_string(workspace().join("client/README.md")).expect("client/README.md");
     let (_, section) = readme.split_once("## Testing your planner on a recording").expect("the section");
     let section = section.split("\n## ").next().expect("its text");
     let start = format!("```{language}\n");

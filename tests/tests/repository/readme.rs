@@ -1,4 +1,4 @@
-//! The commands of the README, run as they are written there.
+//! The commands of the README and of server/README.md, run as they are written there.
 
 use std::fs;
 use std::path::Path;
@@ -9,9 +9,11 @@ use clearway_tests::{binaries, run, workspace};
 
 use crate::fixture::venv;
 
-/// Every command line of the README's `sh` blocks, in order.
+/// Every command line of the `sh` blocks of the README and of server/README.md, in order.
 fn commands() -> Vec<String> {
-    let readme = fs::read_to_string(workspace().join("README.md")).expect("README.md");
+    let pages = ["README.md", "server/README.md"];
+    let read = |page: &str| fs::read_to_string(workspace().join(page)).expect("a page");
+    let readme = pages.map(read).join("\n");
     let mut inside = false;
     let mut lines = Vec::new();
     for line in readme.lines() {
