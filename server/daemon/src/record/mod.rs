@@ -8,4 +8,4 @@
 mod run_config;
 pub mod writer;
 
-pub use run_config::{recorded_vehicles, run_config, verify};
+pub use run_config::{recorded_config, recorded_vehicles, run_config, verify};

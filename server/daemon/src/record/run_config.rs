@@ -16,20 +16,28 @@ use crate::config::{Calibrations, Config};
 /// [`RecordingError::NoConfig`] if the recording has no configuration, [`RecordingError::Config`] if it is invalid,
 /// [`RecordingError::Calibration`] if a table that it names is missing or invalid.
 pub fn run_config(recording: &RecordingReader) -> Result<(Config, Calibrations), RecordingError> {
-    let text = recording.config_text()?;
-    let (known, changed) = without_removed_keys(text);
-    for key in changed {
-        warn!("{}: {key}: its maps may differ", recording.file().display());
-    }
-    let mut config = Config::parse(&known, &recording.file().join("config.toml"), &[])
-        .map_err(|error| RecordingError::Config(error.into()))?;
-    use_rules_of_the_run(&mut config, text);
+    let mut config = recorded_config(recording, &[])?;
+    use_rules_of_the_run(&mut config, recording.config_text()?);
     let tables = config
         .vehicles
         .iter()
         .map(|vehicle| vehicle.sensors.iter().map(|sensor| recording.table(&vehicle.name, sensor)).collect())
         .collect::<Result<_, _>>()?;
     Ok((config, tables))
+}
+
+/// The configuration of the recorded run with some of its keys set to other values. A key that is a constant of this
+/// version is left out, and a warning names it if its recorded value is another one.
+///
+/// # Errors
+/// [`RecordingError::NoConfig`] if the recording has no configuration, [`RecordingError::Config`] if it is invalid.
+pub fn recorded_config(recording: &RecordingReader, set: &[String]) -> Result<Config, RecordingError> {
+    let (text, changed) = without_removed_keys(recording.config_text()?);
+    for key in changed {
+        warn!("{}: {key}: its maps may differ", recording.file().display());
+    }
+    let file = recording.file().join("config.toml");
+    Config::parse(&text, &file, set).map_err(|error| RecordingError::Config(error.into()))
 }
 
 /// The vehicles of a configuration with their calibration tables.

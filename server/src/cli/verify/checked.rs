@@ -11,7 +11,7 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::with_causes;
 use clearway_daemon::base::sync::locked;
 use clearway_daemon::config::{Calibrations, Config};
-use clearway_daemon::record::{recorded_vehicles, run_config, verify};
+use clearway_daemon::record::{recorded_config, recorded_vehicles, run_config, verify};
 use clearway_journal::compare::{After, Comparison, compare};
 use clearway_journal::reader::RecordingReader;
 use clearway_journal::verify::Report;
@@ -183,5 +183,5 @@ fn outcome(file: &Path, check: &Check) -> Result<CheckOutcome> {
 fn overridden(file: &Path, set: &[String]) -> Result<Config> {
     let recording = RecordingReader::open(file)?;
     run_config(&recording)?;
-    Ok(Config::parse(recording.config_text()?, &file.join("config.toml"), set)?)
+    Ok(recorded_config(&recording, set)?)
 }
