@@ -286,7 +286,7 @@ async fn a_configuration_that_is_refused_at_sighup_is_in_status_and_metrics_unti
     };
     let is_successful = async |expected: u32| {
         let metrics = ask(page, "/metrics").await.1;
-        assert!(metrics.contains(&format!("\nclearway_config_last_reload_successful{{}} {expected}\n")), "{metrics}");
+        assert!(metrics.contains(&format!("\nclearway_config_last_reload_successful {expected}\n")), "{metrics}");
     };
     let reasons = async || {
         let text = ask(page, "/vehicles").await.1;

@@ -157,7 +157,10 @@ enum Next {
 /// The short status of each vehicle as JSON, by its name and the run of its server, which all browsers share for half a
 /// second.
 #[derive(Clone, Debug, Default)]
-pub struct Summaries(Arc<Mutex<BTreeMap<(String, u64), (Instant, Arc<str>)>>>);
+pub struct Summaries(Arc<Mutex<BTreeMap<(String, u64), Summary>>>);
+
+/// When a short status was written, and its text.
+type Summary = (Instant, Arc<str>);
 
 impl Summaries {
     fn of(&self, vehicle: &str, boot_id: u64, status: impl FnOnce() -> Value) -> Arc<str> {

@@ -23,7 +23,7 @@ impl TypedValueParser for ModelParser {
     type Value = Model;
 
     fn parse_ref(&self, command: &Command, argument: Option<&Arg>, value: &OsStr) -> Result<Model, Error> {
-        let found = value.to_str().and_then(|name| Self::find(name));
+        let found = value.to_str().and_then(Self::find);
         let name = found.map_or(value, |model| OsStr::new(model.as_str()));
         let name = PossibleValuesParser::new(Model::ALL.map(Model::as_str)).parse_ref(command, argument, name)?;
         name.parse().map_err(|error| Error::raw(ErrorKind::InvalidValue, error))

@@ -242,7 +242,7 @@ mod tests {
     }
 
     fn memory() -> Memory {
-        Memory::new(&MemoryConfig { enabled: true, ..MemoryConfig::default() }).unwrap()
+        Memory::new(&MemoryConfig { enabled: true }).unwrap()
     }
 
     #[test]
