@@ -4,7 +4,7 @@
 //! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine
 //! returns the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as
 //! few reports as the transport can send. It runs in a task of its own, so that a peer that takes no reports keeps
-//! neither a permit nor an event.
+//! neither the engine's time nor an event.
 
 use std::error::Error;
 use std::net::Ipv4Addr;
@@ -13,14 +13,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clearway_proto::v1;
-use futures::future::OptionFuture;
 use futures::{Stream, stream};
+use prost::Message;
 use tokio::sync::mpsc::{self, UnboundedReceiver, channel, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
-use super::admission::{Admitted, Admitting, Source};
+use super::engine_time::{EngineTime, Sender, Waiting};
 use super::gateway::{Gateway, Gateways};
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
+use super::stream_places::StreamPlace;
 use crate::publish::listen::CallPermit;
 use crate::publish::listen::access::Caller;
 
@@ -62,7 +63,7 @@ impl IngestService for Ingest {
             slot.as_ref().inspect(|slot| slot.count("streams"));
             Status::resource_exhausted(format!("{of}: {error}; close one first"))
         };
-        let unnamed = self.gateways.open_unnamed_stream(host);
+        let unnamed = self.gateways.take_unnamed_stream(host);
         let unnamed = unnamed.map_err(|error| full("streams that have not named their vehicle", error))?;
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
@@ -76,15 +77,16 @@ impl IngestService for Ingest {
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let gateway = self.gateways.find(&first.vehicle)?.clone();
         caller.check_vehicle(&gateway.vehicle)?;
-        let source = gateway.open_stream(host);
-        let source = source.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
+        let place = gateway.take_stream(host);
+        let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
         drop(unnamed);
+        let sender = gateway.time.sender_at(host);
         let session = ClientSession::of_sender(0, &gateway.name_stream(host));
-        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), source, session);
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), sender, session, place);
         if first.body.is_none() {
             stream.acknowledge_opening(&first);
         } else {
-            stream.wait_for_admission(first);
+            stream.wait_for_time(first);
         }
         let (report_sender, mut reports) = channel(1);
         tokio::spawn(stream.run(report_sender));
@@ -96,8 +98,8 @@ impl IngestService for Ingest {
 struct IngestStream {
     /// `None` once the stream reads no more observations.
     observations: Option<Streaming<v1::Observation>>,
-    /// The observation that is not admitted yet.
-    waiting: Option<Admitting>,
+    waiting: Option<Waiting>,
+    sender: Sender,
     gateway: Arc<Gateway>,
     gateways: Gateways,
     session: ClientSession,
@@ -105,8 +107,8 @@ struct IngestStream {
     outcomes: UnboundedReceiver<(ObservationId, Outcome)>,
     /// The status that ends the stream, after everything in flight is reported.
     end: Option<Status>,
-    /// The host; the stream counts as open until this is dropped, so it is the last field.
-    source: Source,
+    // The last field, so that it is dropped last.
+    _place: StreamPlace,
 }
 
 impl IngestStream {
@@ -114,20 +116,22 @@ impl IngestStream {
         observations: Streaming<v1::Observation>,
         gateway: Arc<Gateway>,
         gateways: Gateways,
-        source: Source,
+        sender: Sender,
         session: ClientSession,
+        place: StreamPlace,
     ) -> Self {
         let (outcome_sender, outcomes) = unbounded_channel();
         Self {
             observations: Some(observations),
             waiting: None,
+            sender,
             gateway,
             gateways,
             session,
             outcome_sender,
             outcomes,
             end: None,
-            source,
+            _place: place,
         }
     }
 
@@ -146,8 +150,8 @@ impl IngestStream {
                 }
                 return;
             }
-            let has_credit =
-                !has_report && self.waiting.is_none() && self.session.has_credit(self.gateway.in_flight_max);
+            let (events_max, bytes_max) = (self.gateway.in_flight_max, self.gateway.limits.message_bytes_max);
+            let has_credit = !has_report && self.waiting.is_none() && self.session.has_credit(events_max, bytes_max);
             tokio::select! {
                 // Outcomes first, because they give credit.
                 biased;
@@ -161,9 +165,9 @@ impl IngestStream {
                 () = self.gateways.stopped(), if self.observations.is_some() => {
                     self.stop_reading(Some(Status::unavailable("the server stops")));
                 }
-                Some(admitted) = OptionFuture::from(self.waiting.as_mut()) => self.push(admitted),
+                time = Waiting::time(&mut self.waiting), if self.waiting.is_some() => self.push_waiting(time),
                 observation = next_observation(&mut self.observations), if has_credit => match observation {
-                    Ok(Some(observation)) => self.wait_for_admission(observation),
+                    Ok(Some(observation)) => self.wait_for_time(observation),
                     Ok(None) => self.stop_reading(None),
                     Err(status) => {
                         if is_refusal(&status) {
@@ -180,17 +184,18 @@ impl IngestStream {
     fn acknowledge_opening(&mut self, first: &v1::Observation) {
         // A first number is always valid.
         let _ = self.session.check_number(first.number);
-        self.session.begin(first.number, 0);
+        self.session.begin(first.number, 0, 0);
     }
 
-    fn wait_for_admission(&mut self, mut observation: v1::Observation) {
+    fn wait_for_time(&mut self, mut observation: v1::Observation) {
         observation.client = 0;
-        self.waiting = Some(self.gateway.admission.admit(observation, &self.source));
+        let bytes = observation.encoded_len();
+        self.waiting = Some(self.gateway.time.wait(observation, bytes, &self.sender));
     }
 
-    fn push(&mut self, Admitted { observation, permit }: Admitted) {
-        self.waiting = None;
-        if let Err(unknown) = self.gateway.push(observation, permit, &mut self.session, &self.outcome_sender) {
+    fn push_waiting(&mut self, time: EngineTime) {
+        let Some(Waiting { observation, bytes, .. }) = self.waiting.take() else { return };
+        if let Err(unknown) = self.gateway.push(observation, bytes, time, &mut self.session, &self.outcome_sender) {
             self.stop_reading(Some(unknown.into()));
         }
     }

@@ -170,7 +170,8 @@ impl Queues {
         }
         let (samples, receiver) = channel(SAMPLES_MAX);
         let is_accepted = Arc::<AtomicBool>::default();
-        let opened = Source::new(source, receiver, self.count.clone(), is_accepted.clone());
+        let sender = self.gateway.time.sender();
+        let opened = Source::new(source, receiver, self.count.clone(), is_accepted.clone(), sender);
         // An error means that the server stops.
         self.opened.send(opened).ok()?;
         self.count.store(self.all.len() + 1, Ordering::Relaxed);
@@ -193,7 +194,7 @@ mod tests {
     fn queues(points_max: usize) -> (Queues, UnboundedReceiver<Source>) {
         let mut vehicle = Config::of_one_vehicle("car", "top").vehicles.remove(0);
         vehicle.ingest.points_max = points_max;
-        Queues::new(Arc::new(Gateway::new(&vehicle, &event_queue(16).0)))
+        Queues::new(Arc::new(Gateway::new(&vehicle, &event_queue(16).0, Arc::default())))
     }
 
     fn session(number: u8) -> Option<ZenohId> {

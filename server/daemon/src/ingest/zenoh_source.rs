@@ -6,15 +6,14 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use clearway_proto::v1;
-use futures::future::OptionFuture;
 use prost::Message;
+use tokio::sync::Mutex;
 use tokio::sync::mpsc::{Receiver, unbounded_channel};
-use tokio::sync::{Mutex, Semaphore};
 use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
 use zenoh::session::ZenohId;
 
-use super::admission::{Admitted, Admitting, Source as AdmissionSource};
+use super::engine_time::{EngineTime, Sender, Waiting};
 use super::gateway::Gateway;
 use super::observation::ObservationError;
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
@@ -77,10 +76,10 @@ pub(super) struct Source {
     sources: Arc<AtomicUsize>,
     /// True if an observation was accepted.
     is_accepted: Arc<AtomicBool>,
-    admission: AdmissionSource,
+    sender: Sender,
     clients: Clients,
-    /// The observation that is not admitted yet, and its bytes.
-    waiting: Option<Admitting>,
+    /// The observation that waits for the engine's time, and its bytes.
+    waiting: Option<Waiting>,
     waiting_bytes: Option<QueuedBytes>,
 }
 
@@ -91,10 +90,10 @@ impl Source {
         samples: Receiver<QueuedSample>,
         sources: Arc<AtomicUsize>,
         is_accepted: Arc<AtomicBool>,
+        sender: Sender,
     ) -> Self {
         let (clients, waiting, waiting_bytes) = (Clients { of: id, ..Clients::default() }, None, None);
-        let admission = Arc::new(Semaphore::new(1));
-        Self { id, samples, sources, is_accepted, admission, clients, waiting, waiting_bytes }
+        Self { id, samples, sources, is_accepted, sender, clients, waiting, waiting_bytes }
     }
 
     /// Decodes the samples and sends reports, until the channel is closed and everything is reported.
@@ -113,8 +112,8 @@ impl Source {
                         self.record_outcome(id, outcome);
                     }
                 }
-                Some(admitted) = OptionFuture::from(self.waiting.as_mut()) => {
-                    self.push(&common.gateway, admitted, &outcome_sender);
+                time = Waiting::time(&mut self.waiting), if self.waiting.is_some() => {
+                    self.push_waiting(&common.gateway, time, &outcome_sender);
                 }
                 sample = self.samples.recv(), if has_credit => match sample {
                     Some(sample) => self.decode(sample, common).await,
@@ -142,14 +141,15 @@ impl Source {
         self.clients.record_outcome(id, outcome);
     }
 
-    /// True if another sample may be decoded: each source has an equal part of the events that one stream over gRPC may
-    /// have in flight.
+    /// True if another sample may be decoded: each source has an equal part of the events and bytes that one stream
+    /// over gRPC may have in flight.
     fn has_credit(&self, gateway: &Gateway) -> bool {
         let sources = self.sources.load(Ordering::Relaxed).max(1);
-        self.clients.have_credit(gateway.in_flight_max / sources)
+        let (events_max, bytes_max) = (gateway.in_flight_max / sources, gateway.limits.message_bytes_max / sources);
+        self.clients.have_credit(events_max, bytes_max)
     }
 
-    /// Decodes a sample; the observation waits for its admission, or is refused.
+    /// Decodes a sample; the observation waits for the engine's time, or is refused.
     async fn decode(&mut self, sample: QueuedSample, common: &Common) {
         let QueuedSample { key, payload, length, queued } = sample;
         let gateway = &common.gateway;
@@ -172,7 +172,7 @@ impl Source {
             let (rpc, vehicle) = ("/clearway.v1.IngestService/Stream", Some(&*gateway.vehicle));
             if let Err(denied) = senders.lock().await.check(rpc, vehicle, self.id).await {
                 if session.check_number(number).is_ok() {
-                    session.begin(number, 0);
+                    session.begin(number, 0, 0);
                 }
                 return gateway.refuse(session, number, "role", denied);
             }
@@ -187,16 +187,16 @@ impl Source {
                 return gateway.refuse(session, number, "key", message);
             }
         }
-        self.waiting = Some(gateway.admission.admit(observation, &self.admission));
+        self.waiting = Some(gateway.time.wait(observation, length, &self.sender));
         self.waiting_bytes = Some(queued);
     }
 
-    fn push(&mut self, gateway: &Gateway, admitted: Admitted, outcomes: &OutcomeSender) {
-        let Admitted { observation, permit } = admitted;
-        (self.waiting, self.waiting_bytes) = (None, None);
+    fn push_waiting(&mut self, gateway: &Gateway, time: EngineTime, outcomes: &OutcomeSender) {
+        let Some(Waiting { observation, bytes, .. }) = self.waiting.take() else { return };
+        self.waiting_bytes = None;
         let session = &mut self.clients.get_or_insert(observation.client).session;
         // The gateway counts and reports an unknown sensor itself.
-        let _ = gateway.push(observation, permit, session, outcomes);
+        let _ = gateway.push(observation, bytes, time, session, outcomes);
     }
 }
 
@@ -287,14 +287,15 @@ impl Clients {
         self.all.iter().position(|client| client.session.is_idle())
     }
 
-    /// True if another observation of any client, also of a new one, may be decoded: fewer than `events_max` events of
-    /// all clients are in flight, and a new client has space.
-    fn have_credit(&self, events_max: usize) -> bool {
+    /// True if another observation of any client, also of a new one, may be decoded: fewer than `events_max` events and
+    /// `bytes_max` bytes of all clients are in flight, and a new client has space.
+    fn have_credit(&self, events_max: usize, bytes_max: usize) -> bool {
         if self.all.len() >= CLIENTS_MAX && self.longest_idle().is_none() {
             return false;
         }
-        let events: usize = self.all.iter().map(|client| client.session.events()).sum();
-        events == 0 || events < events_max
+        let (events, bytes) =
+            self.all.iter().map(|client| client.session.in_flight()).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+        events == 0 || (events < events_max && bytes < bytes_max)
     }
 
     fn request_repetitions(&mut self) {
@@ -325,10 +326,10 @@ mod tests {
     #[test]
     fn a_new_client_replaces_the_longest_silent_idle_client_or_waits() {
         let mut clients = Clients::default();
-        let has_space = |clients: &Clients| clients.have_credit(usize::MAX);
+        let has_space = |clients: &Clients| clients.have_credit(usize::MAX, usize::MAX);
         for id in 1..=CLIENTS_MAX as u64 {
             assert!(has_space(&clients), "client {id}");
-            clients.get_or_insert(id).session.begin(1, 1);
+            clients.get_or_insert(id).session.begin(1, 1, 10);
         }
         assert!(!has_space(&clients), "each has an event in flight");
         for id in [7, 3] {
@@ -336,7 +337,7 @@ mod tests {
         }
         assert!(has_space(&clients));
         assert_eq!(clients.next_reports().len(), CLIENTS_MAX, "all reports are sent before another client comes");
-        clients.get_or_insert(1000).session.begin(1, 1);
+        clients.get_or_insert(1000).session.begin(1, 1, 10);
         let is_known = |id| clients.all.iter().any(|client| client.id == id);
         assert!(!is_known(3) && is_known(7), "3 was silent longer");
         assert_eq!(clients.next_reports().len(), 1, "the report of the new client");
