@@ -4,7 +4,8 @@
     clearway evaluate OUT --extrinsics $(python3 tests/peers/argoverse.py LOG OUT)
 
 Writes NAME.pcd and NAME.label of each sweep to the folder OUT, and prints the mount of the sensor. The two VLP-32C
-stand on top of one another, so they are one sensor of 64 rings, in a level frame at their middle. The truth is the log's map
+stand on top of one another, so they are one sensor of 64 rings, in a level frame at their middle. The truth is the
+log's map
 of the ground: a point within 0.15 m of the published ground-height raster is ground (road inside a drivable area, else
 other-ground), a point 0.3 m or more above it is an object, and others have no label.
 The packages are installed into an environment below --venv, which is made at the first run.

@@ -36,7 +36,8 @@ pub enum Role {
     /// Prints of each map of a layer, and when the newest becomes stale: the vehicle, `fresh` or why it is stale, its
     /// age in ms, its bytes, `whole` or `delta`.
     Ages {
-        /// Endpoints of routers, as `ZenohClient::connect` takes them. Or `grpc:` and the address of a server, for deltas.
+        /// Endpoints of routers, as `ZenohClient::connect` takes them. Or `grpc:` and the address of a server, for
+        /// deltas.
         endpoints: String,
         /// Names of the vehicles.
         vehicles: String,

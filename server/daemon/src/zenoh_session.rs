@@ -69,7 +69,8 @@ impl ZenohError {
 }
 
 /// The settings of the session. Without access control in the file of `[zenoh]`, no peer may publish what the server
-/// publishes of its `vehicles` ([`own_keys`]), beside the downsampling of that file. A message of a peer may be twice as
+/// publishes of its `vehicles` ([`own_keys`]), beside the downsampling of that file. A message of a peer may be
+/// twice as
 /// long as `observation_bytes_max`, and [`MESSAGE_BYTES_MAX`] in any case.
 ///
 /// # Errors

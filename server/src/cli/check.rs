@@ -40,7 +40,8 @@ pub struct CheckArguments {
 /// Prints the configuration that the options name, as TOML.
 ///
 /// # Errors
-/// [`ConfigError`](clearway_daemon::config::ConfigError), also for a calibration or a certificate that the file names; an error
+/// [`ConfigError`](clearway_daemon::config::ConfigError), also for a calibration or a certificate that the file
+/// names; an error
 /// of certificates that do not fit or of the file of `[zenoh]`.
 pub fn run(options: &CheckArguments) -> Result<()> {
     let CheckArguments { default, configuration } = options;

@@ -34,7 +34,8 @@ pub struct RepairArguments {
 /// Repairs the file and prints what is lost.
 ///
 /// # Errors
-/// [`RepairError`](clearway_journal::repair::RepairError) if the file cannot be read, has no message that can be read, or
+/// [`RepairError`](clearway_journal::repair::RepairError) if the file cannot be read, has no message that can be
+/// read, or
 /// the new file cannot be written.
 pub fn run(options: &RepairArguments) -> Result<Exit> {
     let report = repair(&options.input, &options.output)?;

@@ -271,8 +271,8 @@ impl FoundSensors {
                 sensor.model.as_str()
             );
             text += "[vehicle.sensor.extrinsics]\n\
-                # Measure these: the position relative to the point on the ground under the vehicle's reference point (x\n\
-                # forward, y left), and where azimuth 0 of the sensor points (0: forward, 90: left).\nx_m = 0.0\ny_m = 0.0\nyaw_deg = 0.0\n";
+                # Measure these: the position relative to the point on the ground under the vehicle's reference\n\
+                # point (x forward, y left), and where azimuth 0 of the sensor points (0: forward, 90: left).\nx_m = 0.0\ny_m = 0.0\nyaw_deg = 0.0\n";
             match &sensor.mount {
                 Ok(mount) => {
                     let [pitch, pitch_std, roll, roll_std] =

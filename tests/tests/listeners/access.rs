@@ -1,4 +1,5 @@
-//! Who may do what, on every listener: each call and key against each kind of client. The table stands in deploy/ACCESS.md,
+//! Who may do what, on every listener: each call and key against each kind of client. The table stands in
+//! deploy/ACCESS.md,
 //! and this test holds it equal to what a server with certificates and roles does.
 //!
 //! A new row is one line in [`rows`]. `CLEARWAY_BLESS=1 cargo test --test system access` writes the table.

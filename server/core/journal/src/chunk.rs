@@ -1,6 +1,7 @@
 //! One MCAP chunk -> its records. Damage of any kind is an error and never a panic.
 //!
-//! The crate `mcap` reads records, not chunks: its `LinearReader` fills memory of the size that a chunk claims before it
+//! The crate `mcap` reads records, not chunks: its `LinearReader` fills memory of the size that a chunk claims
+//! before it
 //! has decompressed a byte, reads lz4 through a C library, and its `ChunkReader` aborts at a damaged length.
 
 use std::borrow::Cow;

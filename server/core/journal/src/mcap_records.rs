@@ -91,7 +91,8 @@ pub(super) struct McapRecords {
     crc: Hasher,
     /// Number of lost parts of the data section.
     lost_data: usize,
-    /// The bytes of message indexes that do not agree with their chunk: they are damaged if the CRC of the data is wrong.
+    /// The bytes of message indexes that do not agree with their chunk: they are damaged if the CRC of the data is
+    /// wrong.
     wrong_indexes: Vec<(u64, u64)>,
     end: FileEnd,
     lost: Vec<LostPart>,

@@ -135,7 +135,8 @@ struct VehicleReplay {
     extra: BTreeSet<(u64, String)>,
 }
 
-/// Verifies a recording with the recorded configuration of its vehicles. A map that differs and a damaged part are no errors; the [`Report`] contains them.
+/// Verifies a recording with the recorded configuration of its vehicles. A map that differs and a damaged part are
+/// no errors; the [`Report`] contains them.
 ///
 /// # Errors
 /// [`VerifyError::Recording`] if the file is not a recording or cannot be read, [`VerifyError::Config`] if its

@@ -27,7 +27,8 @@ impl TokenBucket {
         is_left
     }
 
-    /// Takes `count` tokens, at most as many as the bucket holds. Returns the time until it has them, and takes none, if
+    /// Takes `count` tokens, at most as many as the bucket holds. Returns the time until it has them, and takes
+    /// none, if
     /// there are too few.
     pub fn take_many(&mut self, count: u32, now: Instant) -> Option<Duration> {
         self.fill(now);

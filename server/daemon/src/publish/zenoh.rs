@@ -11,7 +11,8 @@
 //!
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
 //!
-//! A server that is the client of a router has one map of a vehicle on the way at a time ([`Pace`]), so that a thin link
+//! A server that is the client of a router has one map of a vehicle on the way at a time ([`Pace`]), so that a thin
+//! link
 //! has fewer maps and not older ones; the maps between count as skipped.
 //!
 //! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a

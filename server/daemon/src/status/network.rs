@@ -1,4 +1,5 @@
-//! What a server knows of its network: listeners that hang, the router it has no session with, certificates that end, and
+//! What a server knows of its network: listeners that hang, the router it has no session with, certificates that
+//! end, and
 //! a configuration that was not read again.
 
 use std::sync::Mutex;

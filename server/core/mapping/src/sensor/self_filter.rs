@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::value_check::{ConfigValueError, check};
 
-/// The box around the vehicle, ego frame; the table `[vehicle.body]`. It has no lower end: what is under the vehicle belongs to it.
+/// The box around the vehicle, ego frame; the table `[vehicle.body]`. It has no lower end: what is under the vehicle
+/// belongs to it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BodyConfig {
