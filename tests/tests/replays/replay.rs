@@ -222,7 +222,7 @@ fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
         ("folder/", "name a file"),
         ("other.mcap", "exists"),
         ("later.mcap", "parts of an earlier recording of this name are beside it"),
-        ("busy.mcap", "exists"),
+        ("busy.mcap", "parts of an earlier recording of this name are beside it"),
         ("busy.unfinished.mcap", "a recording that is being written"),
     ] {
         let (success, error) = replay(&["a.mcap", "--record", output]);
