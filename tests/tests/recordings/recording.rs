@@ -318,6 +318,7 @@ async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
 
 #[test]
 fn a_full_disk_ends_the_recording_and_maps_continue() {
+    let _ports = clearway_tests::serial::DEFAULT_PORTS.enter();
     let folder = tempfile::tempdir().unwrap();
     // No file of this process may grow beyond 1.5 MiB, a few chunks; the write fails instead of the process.
     let limited = "trap '' XFSZ; ulimit -f 3072; exec \"$0\" demo --seconds 4 --record \"$1/full.mcap\"";
