@@ -37,13 +37,10 @@ use query::{LayerKey, QUERY_TIMEOUT, failed};
 use subscription::LayerSubscription;
 
 /// Settings of every session. They override those of a configuration file.
-const SETTINGS: [(&str, &str); 10] = [
+const SETTINGS: [(&str, &str); 9] = [
     ("listen/endpoints", "[]"),
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
-    // Each endpoint once. With a time-out zenoh tries the first of a client's endpoints again until the time is over,
-    // and never the next one.
-    ("connect/timeout_ms", "0"),
     ("connect/exit_on_failure", "false"),
     // Tries again at most 0.5 s after an attempt.
     ("connect/retry", "{ period_init_ms: 100, period_max_ms: 500, period_increase_factor: 2 }"),
@@ -56,6 +53,13 @@ const SETTINGS: [(&str, &str); 10] = [
     ("transport/link/tcp", "{ so_rcvbuf: 262144 }"),
     ("transport/link/tls/so_rcvbuf", "262144"),
 ];
+/// The mode of a session that has one router, the separator of its endpoints, and `connect/timeout_ms`: each endpoint
+/// once. With a time-out zenoh tries the first of a client's endpoints again until the time is over, and never the next
+/// one.
+const CLIENT: (&str, char, &str) = ("'client'", ',', "0");
+/// The same of a session that has all routers: each endpoint until it answers. Without a time-out zenoh never tries an
+/// endpoint again that did not answer a peer at the start.
+const PEER: (&str, char, &str) = ("'peer'", '+', "-1");
 /// Longest time in which a router must begin to answer. Ours: a router and its readers may start together.
 const OPEN_MAX: Duration = Duration::from_secs(5);
 /// Time between two attempts to open a session.
@@ -129,14 +133,15 @@ impl ZenohClient {
     }
 
     async fn open(endpoint: &str, mut config: Config) -> Result<Self, ClientError> {
-        // A client has one router, a peer has all.
-        let (mode, separator) = if endpoint.contains('+') { ("'peer'", '+') } else { ("'client'", ',') };
-        for (key, value) in SETTINGS.into_iter().chain([("mode", mode)]) {
+        let (mode, separator, timeout_ms) = if endpoint.contains('+') { PEER } else { CLIENT };
+        for (key, value) in SETTINGS.into_iter().chain([("mode", mode), ("connect/timeout_ms", timeout_ms)]) {
             config.insert_json5(key, value).map_err(failed(format!("{key} = {value}")))?;
         }
         let endpoints = format!("{:?}", endpoint.split(separator).collect::<Vec<_>>());
         config.insert_json5("connect/endpoints", &endpoints).map_err(failed(format!("endpoint {endpoint:?}")))?;
-        let (until, (mut open_timeout_ms, longest_ms)) = (Instant::now() + OPEN_MAX, OPEN_TIMEOUT_MS);
+        let (until, (first_ms, longest_ms)) = (Instant::now() + OPEN_MAX, OPEN_TIMEOUT_MS);
+        // The one attempt to open a peer goes on in the background.
+        let mut open_timeout_ms = if endpoint.contains('+') { longest_ms } else { first_ms };
         loop {
             let setting = "transport/unicast/open_timeout";
             config.insert_json5(setting, &open_timeout_ms.to_string()).map_err(failed(setting))?;

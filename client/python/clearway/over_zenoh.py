@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     import zenoh.ext
 
 _TIMEOUT_S = 5.0
-#: Time until the next attempt to open a session; longest time for an endpoint to answer, in ms, in the first attempt
-#: and
+#: Time until the next attempt to open a session; longest time for an endpoint to answer, in ms, in the first attempt and
 #: in the attempts after it.
 _OPEN_RETRY_S, _OPEN_TIMEOUT_MS = 0.2, (500, 2000)
 #: Most gaps kept between two samples. If there are more (the process was suspended), the first count as skipped and not
@@ -48,7 +47,6 @@ _SETTINGS = {
     "listen/endpoints": [],
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
-    "connect/timeout_ms": 0,
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "transport/link/tx/lease": 2000,
@@ -73,11 +71,13 @@ def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
         files = {_CERTIFICATES[name]: path for name, path in tls.files().items()}
         # Without this setting the client presents no certificate.
         encrypted |= files | {"enable_mtls": tls.cert is not None}
-    of_endpoint = {"mode": "peer" if "+" in endpoint else "client", "connect/endpoints": endpoints}
+    mode, timeout_ms = ("peer", -1) if "+" in endpoint else ("client", 0)
+    of_endpoint = {"mode": mode, "connect/timeout_ms": timeout_ms, "connect/endpoints": endpoints}
     config = zenoh.Config()
     for key, value in (_SETTINGS | of_endpoint | {"transport/link/tls": encrypted}).items():
         config.insert_json5(key, json.dumps(value))
-    until, (open_timeout_ms, longest_ms) = time.monotonic() + _TIMEOUT_S, _OPEN_TIMEOUT_MS
+    until, (first_ms, longest_ms) = time.monotonic() + _TIMEOUT_S, _OPEN_TIMEOUT_MS
+    open_timeout_ms = first_ms if mode == "client" else longest_ms
     while True:
         config.insert_json5("transport/unicast/open_timeout", str(open_timeout_ms))
         try:

@@ -153,6 +153,21 @@ async fn a_dead_router_before_a_live_one_costs_a_planner_no_maps() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_planner_of_all_routers_has_the_maps_of_a_router_that_starts_after_it() {
+    let [dead, late] = [(); 2].map(|()| std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap());
+    let (_client, mut maps) = planner(&format!("tcp/{dead}+tcp/{late}")).await;
+    let (router, at) = router(late.port(), &[]).await;
+    let running = behind(&at).await;
+    let mut made = 0;
+    while made == 0 {
+        made = feed(&running, readings(2)).await;
+    }
+    Given::default().receive_up_to(made - 1, &mut maps).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+    router.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_layer_without_subscribers_is_made_at_once_for_a_new_planner() {
     let mut config = config();
     config.zenoh.enabled = true;
