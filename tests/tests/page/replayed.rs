@@ -49,10 +49,10 @@ fn await_map(browser: &Browser, sequence: u64) {
 
 pub fn cells_are_those_of_the_client() {
     beside_a_replay(async |browser, client| {
-        browser.until("layers", "return document.querySelectorAll('.layer').length === 6");
+        browser.until("layers", "return document.querySelectorAll('.layer').length === 7");
         browser.run(ALL_LAYERS);
         let map = stop_at(client, 0.5).await;
-        assert_eq!(map.layers().len(), 6);
+        assert_eq!(map.layers().len(), 7);
         await_map(browser, map.sequence());
         let mut compared = 0;
         // From the vehicle: one cell, then ten ahead, then to the left and the right of it.

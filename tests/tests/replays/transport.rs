@@ -101,7 +101,7 @@ async fn transport(address: &str) -> ReplayServiceClient<Channel> {
 fn recorded_maps(file: &Path) -> Vec<(i64, Bytes)> {
     let mut maps: BTreeMap<u64, v1::Map> = BTreeMap::new();
     let layers = fixture::recorded(file);
-    for name in ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path"] {
+    for name in ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path", "freespace"] {
         for ((sequence, layer), bytes) in layers.iter().filter(|((_, layer), _)| layer == name) {
             let mut map = v1::Map::decode(bytes.clone()).unwrap();
             assert_eq!(map.layers.len(), 1, "{layer}");

@@ -28,6 +28,7 @@ use crate::value_check::check_name;
 pub use crate::fusion::config::FusionConfig;
 pub use crate::ground::config::{GroundConfig, Variant as GroundVariant};
 pub use crate::layer::drivability::config::{DrivabilityConfig, DrivabilityVariant, Passage, PlaneTest, Seed};
+pub use crate::layer::freespace::config::FreespaceConfig;
 pub use crate::layer::height_difference::config::HeightDifferenceConfig;
 pub use crate::layer::occupancy::config::{Hits, OccupancyConfig, OccupancyVariant};
 pub use crate::layer::registry::MapsConfig;

@@ -15,7 +15,7 @@
 //! | [`memory`] | the points of earlier maps -> the points that the newest map lacks |
 //! | [`ground`] | the points of one map -> height of the local ground, shared by all layers |
 //! | [`reach`] | the points of one map and their ground -> obstacles, and what the vehicle can reach |
-//! | [`layer`] | the points of one map -> one layer for each of the six maps |
+//! | [`layer`] | the points of one map -> one layer for each of the seven maps |
 //! | [`map`] | what a map contains |
 //! | `azimuth_columns`, `value_check` | position -> column of azimuth; value of a key -> error |
 //! | [`vehicle_outline`] | the vehicle, seen from above |

@@ -127,7 +127,7 @@ fn each_revolution_gives_a_map_and_the_end_gives_a_partial_one() {
     assert!(whole.capture_end_ns - whole.capture_start_ns > 95_000_000);
     assert!(whole.completed_ns >= whole.capture_end_ns);
     let names: Vec<&str> = whole.layers.iter().map(|layer| layer.name).collect();
-    assert_eq!(names, ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path"]);
+    assert_eq!(names, ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path", "freespace"]);
     assert!(common::figure(&whole.layers[0], "drivable_share") > 0.95);
     assert_eq!(made.last().unwrap().sensors[0].partial, "end");
     assert_eq!(made.last().unwrap().completed_ns, 7);
@@ -394,7 +394,7 @@ fn recorded_drives_become_maps_with_the_road_drivable() {
 
 #[test]
 fn an_inactive_layer_is_not_made_until_the_next_map_after_its_activation() {
-    let all = ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path"];
+    let all = ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path", "freespace"];
     let names = |map: &Map| map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>();
     let (mut all_active, mut some_active) = (pipeline(None), pipeline(None));
     assert_eq!(all_active.layers_made(), all.map(|layer| (layer, 0)));
@@ -423,7 +423,7 @@ fn an_inactive_layer_is_not_made_until_the_next_map_after_its_activation() {
     }
     assert_eq!(all_active.layers_made(), all.map(|layer| (layer, 6)));
     let made: Vec<u64> = some_active.layers_made().iter().map(|(_, made)| *made).collect();
-    assert_eq!(made, [2, 1, 2, 3, 2, 2]);
+    assert_eq!(made, [2, 1, 2, 3, 2, 2, 1]);
 }
 
 /// A scan of five rings on level ground, each range longer or shorter by turns.

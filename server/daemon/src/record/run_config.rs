@@ -162,6 +162,9 @@ fn use_rules_of_the_run(config: &mut Config, text: &str) {
         if recorded.get("time").is_none() {
             vehicle.time = TimeConfig::WITHOUT_EPOCHS;
         }
+        if recorded.get("maps").is_some_and(|maps| maps.get("freespace").is_none()) {
+            vehicle.maps.freespace.enabled = false;
+        }
     }
 }
 

@@ -15,7 +15,7 @@ use clearway_proto::v1;
 use prost::Message;
 
 /// Most payloads kept for one map; further ones are encoded for each reader. Ours: ten readers with regions of their
-/// own, six layers each.
+/// own, seven layers each.
 const PAYLOADS_MAX: usize = 64;
 
 /// Payloads of one map, by layer, region and base.

@@ -1,4 +1,4 @@
-//! The six maps, one folder each, and what they share.
+//! The seven maps, one folder each, and what they share.
 //!
 //! | file | content |
 //! |---|---|
@@ -8,7 +8,8 @@
 //! | `grid` | where the cells lie |
 //! | [`radial_grid`] | r-θ grid: position -> cell |
 //! | [`roughness`] | deviations of the points -> roughness by cell, for `terrain` and `speed` |
-//! | `registry` | the list of the six; which of them are active |
+//! | `registry` | the list of the seven; which of them are active |
+//! | [`freespace`] | where the whole vehicle can drive: the layer to plan on; not in the papers |
 //! | [`drivability`] | UT Austin thesis, section IV |
 //! | [`height_difference`] | UT Austin thesis, section V: the baseline |
 //! | [`terrain`] | Neuhaus 2009, section 2 |
@@ -23,6 +24,7 @@
 mod channel;
 mod class;
 pub mod drivability;
+pub mod freespace;
 mod grid;
 pub mod height_difference;
 mod maker;

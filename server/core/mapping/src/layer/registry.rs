@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 use crate::ground::config::GroundConfig;
 use crate::layer::drivability::Drivability;
 use crate::layer::drivability::config::DrivabilityConfig;
+use crate::layer::freespace::Freespace;
+use crate::layer::freespace::config::FreespaceConfig;
 use crate::layer::height_difference::HeightDifference;
 use crate::layer::height_difference::config::HeightDifferenceConfig;
 use crate::layer::maker::{Context, Layer, LayerMaker};
@@ -114,6 +116,8 @@ layers! {
     speed: Speed, SpeedConfig;
     /// The layer `safe_path` (UT Austin thesis, section VI).
     safe_path: SafePath, SafePathConfig;
+    /// The layer `freespace`, the one to plan on.
+    freespace: Freespace, FreespaceConfig;
 }
 
 /// The enabled layers, active or not.

@@ -12,8 +12,8 @@ use std::f32::consts::TAU;
 use crate::ground::polar::{COLUMNS, ROWS, column_directions, row_middles_m};
 use crate::ground::surface::Confidence;
 
+use super::bits::Bits;
 use super::cells::{SIDE, cell, centre_m};
-use super::flood::Bits;
 use super::joins::draw;
 
 /// Greatest distance of a step from the vehicle, metres. Ours: as far as the plane under the vehicle is fitted.

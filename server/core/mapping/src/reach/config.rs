@@ -22,6 +22,9 @@ pub struct ReachConfig {
     /// Least height of an obstacle over the local ground, metres; the vehicle drives over lower ones. 0.25 is ours: one
     /// unit of the layer `drivability`.
     pub obstacle_m_min: f32,
+    /// Ground clearance of the vehicle, metres: the layer `freespace` calls a thing between it and `obstacle_m_min` low.
+    /// At most `obstacle_m_min`. 0.15 is ours, a car.
+    pub clearance_m: f32,
     /// Greatest height of an obstacle over the local ground, metres; the vehicle passes under higher ones. 2.5: UT
     /// Austin thesis, section IV.2.
     pub overhang_m: f32,
@@ -37,6 +40,7 @@ impl Default for ReachConfig {
             vehicle_front_m: 3.0,
             vehicle_rear_m: 2.0,
             obstacle_m_min: 0.25,
+            clearance_m: 0.15,
             overhang_m: 2.5,
             step_m_max: 0.3,
         }
@@ -54,10 +58,13 @@ impl ReachConfig {
             ("vehicle_front_m", self.vehicle_front_m, (0.0..=20.0, "0 to 20")),
             ("vehicle_rear_m", self.vehicle_rear_m, (0.0..=20.0, "0 to 20")),
             ("obstacle_m_min", self.obstacle_m_min, (0.05..=2.0, "0.05 to 2")),
+            ("clearance_m", self.clearance_m, (0.05..=2.0, "0.05 to 2")),
             ("overhang_m", self.overhang_m, (0.5..=20.0, "0.5 to 20")),
             ("step_m_max", self.step_m_max, (0.05..=2.0, "0.05 to 2")),
         ];
         check_each(at, values)?;
+        let lower = self.clearance_m <= self.obstacle_m_min;
+        check_fits(at, "clearance_m", self.clearance_m, lower, "at most obstacle_m_min")?;
         let higher = self.overhang_m > self.obstacle_m_min;
         check_fits(at, "overhang_m", self.overhang_m, higher, "more than obstacle_m_min")
     }

@@ -8,8 +8,9 @@
 
 use std::f32::consts::TAU;
 
+use super::bits::Bits;
 use super::cells::{SIDE, centre_m};
-use super::flood::{Bits, Flood};
+use super::flood::Flood;
 
 /// Number of directions. Ours: those of the ground's estimate.
 const DIRECTIONS: usize = 180;

@@ -8,9 +8,9 @@
 
 use std::f32::consts::PI;
 
+use super::bits::Bits;
 use super::blind_zone::{VEHICLE_M, is_of_ground};
 use super::cells::{CELL_M, NOWHERE, SIDE, cell, centre_m};
-use super::flood::Bits;
 use super::obstacles::Obstacles;
 
 /// Greatest distance of a step from the vehicle, metres. Ours; 12 to 20 are nearly

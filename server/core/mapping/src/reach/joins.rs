@@ -8,8 +8,8 @@
 use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside, row_middles_m};
 use crate::ground::surface::Confidence;
 
+use super::bits::Bits;
 use super::cells::SIDE;
-use super::flood::Bits;
 
 /// Longest gap, as a share of the range of its outer end. Ours: the gaps that the estimate of the ground bridges.
 const GAP_SHARE_MAX: f32 = 0.44;

@@ -19,8 +19,9 @@
 //! | open and closed cells -> reached cells | `flood` |
 //! | reached cells -> those without a detour over farther ground | `directions` |
 
+mod bits;
 mod blind_zone;
-mod cells;
+pub(crate) mod cells;
 pub mod config;
 mod directions;
 mod edges;
@@ -38,12 +39,13 @@ use crate::ground::surface::Confidence;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 
+use bits::Bits;
 use blind_zone::BlindZone;
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
 use directions::Directions;
 use edges::Edges;
-use flood::{Bits, Flood};
+use flood::Flood;
 use joins::Joins;
 use obstacles::Obstacles;
 use polar_runs::{PolarRuns, WORD};
@@ -63,12 +65,14 @@ const STRIP_M: f32 = 1.0;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 enum View {
-    /// It does not.
+    /// It does not: no ground was seen around it.
     Closed = 0,
     /// It does.
     Clear = 0b01,
     /// It does where no obstacle casts a shadow on it.
     BesideObstacle = 0b10,
+    /// It does not, because an obstacle hides it.
+    Hidden = 0b100,
 }
 
 /// Cell of [`Reach`] that contains a position; [`ReachCell::at`] finds it once for a fixed position.
@@ -89,6 +93,19 @@ impl ReachCell {
     }
 }
 
+/// What the reach stage knows of its cells: a bit each, 64 cells a word, the first cell in the lowest bit, row by row.
+#[derive(Clone, Copy)]
+pub(crate) struct ReachRows<'a> {
+    /// The vehicle gets there: the disc covers the cell somewhere on its path.
+    pub reached: &'a [u64],
+    /// An obstacle stands there, or a step of the ground ends there.
+    pub closed: &'a [u64],
+    /// Ground that was seen, or that lies in a gap of seen ground which no obstacle hides.
+    pub open: &'a [u64],
+    /// Unseen ground behind or right beside an obstacle.
+    pub hidden: &'a [u64],
+}
+
 /// Closed cells and reached ground around the vehicle, ego frame.
 #[derive(Clone)]
 pub struct Reach {
@@ -107,6 +124,8 @@ pub struct Reach {
     /// By polar cell.
     views: Vec<View>,
     open: Bits,
+    /// The cells whose ground an obstacle hides.
+    hidden: Bits,
     closed: Bits,
     joins: Joins,
     blind_zone: BlindZone,
@@ -137,6 +156,7 @@ impl Reach {
             has_obstacle: vec![false; CELLS],
             views: vec![View::Closed; CELLS],
             open: bits.clone(),
+            hidden: bits.clone(),
             closed: bits.clone(),
             joins: Joins::new(),
             blind_zone: BlindZone::new(),
@@ -227,6 +247,16 @@ impl Reach {
         cell.index().is_some_and(|cell| self.flood.is_reached(cell % SIDE, cell / SIDE))
     }
 
+    /// Closed cells and reached ground as rows of bits.
+    pub(crate) fn rows(&self) -> ReachRows<'_> {
+        ReachRows {
+            reached: self.flood.reached(),
+            closed: self.closed.words(),
+            open: self.open.words(),
+            hidden: self.hidden.words(),
+        }
+    }
+
     /// Opens the cells with a return from the ground, and the unseen ones between them. Unseen ground right behind an
     /// obstacle is not opened, nor is ground in a shadow beside an obstacle: they may hide the continuation of a fence.
     fn open_seen_ground(&mut self, sensor_m: f32, confidences: &[Confidence]) {
@@ -241,10 +271,11 @@ impl Reach {
             }
         }
         self.classify_polar_cells(confidences);
-        let (runs, shadow, views) = (&self.polar_runs, &self.shadow, &self.views);
+        let (runs, shadow, views, hidden) = (&self.polar_runs, &self.shadow, &self.views, &mut self.hidden);
         self.open.fill_words(|cells| {
             let view_of = |polar: PolarIndex| polar.of(views).map_or(View::Closed as u8, |view| *view as u8);
-            let [mut clear, mut beside] = runs.bits(cells.start / WORD, view_of);
+            let [mut clear, mut beside, behind] = runs.bits(cells.start / WORD, view_of);
+            hidden.set_word(cells.start / WORD, behind | beside);
             while beside != 0 {
                 let bit = beside.trailing_zeros() as usize;
                 clear |= u64::from(!shadow.hides(cells.start + bit)) << bit;
@@ -252,6 +283,7 @@ impl Reach {
             }
             clear
         });
+        self.hidden.remove(&self.open);
         self.open.add(self.steps.seen());
         for cell in &self.under_vehicle {
             self.open.set(cell % SIDE, cell / SIDE);
@@ -266,7 +298,7 @@ impl Reach {
                 let cell = row * COLUMNS + column;
                 is_hidden = self.has_obstacle[cell] || is_hidden && confidences[cell] != Confidence::Seen;
                 self.views[cell] = match confidences[cell] {
-                    Confidence::Bridged if is_hidden => View::Closed,
+                    Confidence::Bridged | Confidence::Extrapolated | Confidence::None if is_hidden => View::Hidden,
                     Confidence::Seen | Confidence::Bridged if self.is_beside_obstacle(row, column) => {
                         View::BesideObstacle
                     }

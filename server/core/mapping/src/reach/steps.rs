@@ -3,9 +3,9 @@
 //! In: cells and heights of the returns from the ground, metres. Out: the cells on both sides of a step that is too
 //! high and too steep for the vehicle. Two cells at most two cells apart are compared, so that a grade is no step.
 
+use super::bits::Bits;
 use super::cells::{CELL_M, SIDE};
 use super::config::{ReachConfig, STEP_SLOPE_MIN};
-use super::flood::Bits;
 
 /// Lowest height over the ground of a return that is used, metres. Ours: lower ones are mirror images.
 const LOWEST_M: f32 = -1.5;

@@ -6,8 +6,8 @@
 //! and the other lower. The foot of a step that is as high counts too. Cells are compared in a grid of half their
 //! resolution.
 
+use super::bits::Bits;
 use super::cells::SIDE;
-use super::flood::Bits;
 
 /// Number of cells along a side of a coarse cell.
 const FOLD: usize = 2;
