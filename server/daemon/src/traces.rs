@@ -38,7 +38,6 @@ pub struct Traces(Option<Exporting>);
 struct Exporting {
     tracer: SdkTracer,
     provider: SdkTracerProvider,
-    one_in: u64,
 }
 
 impl Traces {
@@ -58,13 +57,13 @@ impl Traces {
             .with_id_generator(RootIds::default())
             .with_resource(Resource::builder().with_service_name("clearway").with_attribute(instance).build())
             .build();
-        Ok(Self(Some(Exporting { tracer: provider.tracer("clearway"), provider, one_in: options.one_in })))
+        Ok(Self(Some(Exporting { tracer: provider.tracer("clearway"), provider })))
     }
 
     /// Traces a map that has just been published, and the stages until then that are known: in the queue, computed,
     /// encoded, and in all since the end of capture.
     pub fn published(&self, map: &EncodedMap, [waited, computed, encoded, age]: [Option<Duration>; 4]) {
-        let Some(exporting) = self.of(map) else { return };
+        let Some(exporting) = &self.0 else { return };
         let end = SystemTime::now();
         let encode = before(end, encoded);
         let compute = before(encode, computed);
@@ -89,7 +88,7 @@ impl Traces {
     /// Begins the span of a hop after the publication; it ends when the value is dropped.
     pub fn hop(&self, map: &EncodedMap, name: &'static str, transport: Option<&'static str>) -> Hop {
         let attributes = transport.map(|transport| KeyValue::new("transport", transport)).into_iter().collect();
-        let span = self.of(map).map(|exporting| exporting.child(map, name, SystemTime::now(), attributes));
+        let span = self.0.as_ref().map(|exporting| exporting.child(map, name, SystemTime::now(), attributes));
         Hop { _span: span.map(Box::new) }
     }
 
@@ -98,11 +97,6 @@ impl Traces {
         if let Some(Err(error)) = self.0.map(|exporting| exporting.provider.shutdown_with_timeout(SHUTDOWN_TIMEOUT)) {
             tracing::warn!(%error, "the last traces are lost");
         }
-    }
-
-    /// What exports, if `map` is traced.
-    fn of(&self, map: &EncodedMap) -> Option<&Exporting> {
-        self.0.as_ref().filter(|exporting| map.sequence.is_multiple_of(exporting.one_in))
     }
 }
 

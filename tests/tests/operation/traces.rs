@@ -103,17 +103,6 @@ async fn the_trace_of_a_map_has_every_hop_and_the_id_that_its_header_tells() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn one_revolution_in_as_many_as_configured_is_traced() {
-    let (endpoint, received) = collector().await;
-    let mut config = config();
-    (config.traces.endpoint, config.traces.one_in) = (endpoint, 3);
-    let running = start(config).await;
-    let maps = feed(&running, readings(7)).await;
-    running.shutdown().await.unwrap();
-    assert_eq!(traces(received).len() as u64, maps.div_ceil(3), "{maps}");
-}
-
-#[tokio::test(flavor = "multi_thread")]
 async fn a_collector_that_never_answers_costs_no_map() {
     let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let mut config = config();

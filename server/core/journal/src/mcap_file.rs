@@ -52,16 +52,8 @@ pub struct Header {
     pub metadata: BTreeMap<String, String>,
 }
 
-/// How an MCAP file is written.
-#[derive(Clone, Copy, Debug)]
-pub struct McapFileOptions {
-    /// Length of a chunk before its compression, in KiB.
-    pub chunk_kb: u64,
-    /// True if chunks are compressed with zstd.
-    pub is_compressed: bool,
-    /// What is written of the maps.
-    pub maps: RecordedMaps,
-}
+/// Length of a chunk before its compression, in bytes. Ours: what a damaged byte costs at most.
+const CHUNK_BYTES: u64 = 1 << 20;
 
 /// The disk that receives the bytes of one file: a file, or a simulated disk in tests.
 pub trait Disk: Write + Send {
@@ -162,13 +154,13 @@ struct VehicleChannels {
 
 impl<D: Disk> McapFile<D> {
     /// Writes the header of part number `part` to `disk`.
-    pub fn create(disk: D, options: McapFileOptions, header: &Header, part: u64) -> Result<Self, McapError> {
+    pub fn create(disk: D, recorded: RecordedMaps, header: &Header, part: u64) -> Result<Self, McapError> {
         let disk = SharedDisk(Arc::new(Mutex::new(StopAtFailure { disk, failed: None, bytes: 0 })));
         let mut writer = WriteOptions::new()
             .profile("")
             .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
-            .compression(options.is_compressed.then_some(mcap::Compression::Zstd))
-            .chunk_size(Some(options.chunk_kb << 10))
+            .compression(Some(mcap::Compression::Zstd))
+            .chunk_size(Some(CHUNK_BYTES))
             .calculate_chunk_crcs(true)
             .calculate_data_section_crc(true)
             .calculate_summary_section_crc(true)
@@ -186,7 +178,7 @@ impl<D: Disk> McapFile<D> {
         metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
         metadata.insert("vehicles".into(), names.join(","));
         metadata.insert("part".into(), part.to_string());
-        metadata.insert("maps".into(), options.maps.as_str().into());
+        metadata.insert("maps".into(), recorded.as_str().into());
         writer.write_metadata(&Metadata { name: "clearway".into(), metadata })?;
         let mut attach = |name: String, media_type: &str, text: &str| {
             let data = text.as_bytes().into();
@@ -197,7 +189,7 @@ impl<D: Disk> McapFile<D> {
             attach(format!("calibration/{vehicle}/{sensor}.yaml"), "application/yaml", yaml)?;
         }
         let event = writer.add_schema("clearway.v1.Event", "protobuf", RECORDING_DESCRIPTORS)?;
-        let of_maps = if options.maps == RecordedMaps::Digest { "clearway.v1.MapDigest" } else { "clearway.v1.Map" };
+        let of_maps = if recorded == RecordedMaps::Digest { "clearway.v1.MapDigest" } else { "clearway.v1.Map" };
         let map = writer.add_schema(of_maps, "protobuf", RECORDING_DESCRIPTORS)?;
         let keyframe = writer.add_schema("clearway.v1.Keyframe", "protobuf", RECORDING_DESCRIPTORS)?;
         let counts = writer.add_schema("clearway.v1.RecordingCounts", "protobuf", RECORDING_DESCRIPTORS)?;
@@ -208,12 +200,12 @@ impl<D: Disk> McapFile<D> {
             let keyframes = channel(keyframe, &format!("/{vehicle}/keyframe"))?;
             let maps = layers
                 .iter()
-                .map(|&layer| Ok((layer, channel(map, &topic_of_layer(vehicle, layer, options.maps))?)))
+                .map(|&layer| Ok((layer, channel(map, &topic_of_layer(vehicle, layer, recorded))?)))
                 .collect::<Result<_, McapError>>()?;
             vehicles.push(VehicleChannels { journal, keyframes, maps });
         }
         let counts = channel(counts, "/recorder/counts")?;
-        let mut file = Self { writer, disk, vehicles, counts, newest_ns: 0, records: options.maps };
+        let mut file = Self { writer, disk, vehicles, counts, newest_ns: 0, records: recorded };
         file.sync()?;
         Ok(file)
     }

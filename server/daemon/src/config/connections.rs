@@ -17,8 +17,10 @@ pub struct Connections {
     /// Addresses that are known peers; so are the names in certificates and tokens that have a role.
     pub known: Vec<IpAddr>,
     /// A connection without a request for this time is closed, in s.
+    #[serde(skip)]
     pub idle_s: u64,
     /// A connection that receives nothing of what waits for it for this time is closed, in s.
+    #[serde(skip)]
     pub stalled_s: u64,
     /// Most gRPC calls at once, of all readers and senders.
     pub calls_max: usize,
@@ -88,8 +90,6 @@ impl Connections {
             false => Err(ValueError::new(format!("connections.{key}"), value, format!("1 to {most}"))),
         };
         number("per_address_max", self.per_address_max as u64, 65_536)?;
-        number("idle_s", self.idle_s, 86_400)?;
-        number("stalled_s", self.stalled_s, 3600)?;
         number("calls_max", self.calls_max as u64, 1 << 20)?;
         number("calls_per_address_max", self.calls_per_address_max as u64, 1 << 20)?;
         if self.kept > 65_535 {

@@ -3,7 +3,6 @@
 use std::path::PathBuf;
 
 use clearway_journal::RecordedMaps;
-use clearway_journal::mcap_file::McapFileOptions;
 use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
@@ -17,13 +16,17 @@ pub struct Recorder {
     /// Longest time from a message to the disk, in ms: what a crash or a power cut may cost of the recording. A sync
     /// begins after half of it.
     pub flush_ms: u64,
-    /// Events and maps that may wait for the disk; more are counted as dropped.
+    /// Events and maps that may wait for the disk; more are counted as dropped. A constant but in tests.
+    #[serde(skip)]
     pub queue: usize,
     /// Length in MiB from which the next part begins; 0: no limit.
     pub part_mb: u64,
     /// Time in seconds after which the next part begins; 0: no limit.
     pub part_s: u64,
-    /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded.
+    /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded: more
+    /// than the time for which any layer remembers ([`GROUND_S_MAX`](clearway_mapping::memory::config::GROUND_S_MAX)), else
+    /// each new part would change the maps. A constant but in tests.
+    #[serde(skip)]
     pub warm_up_ms: u64,
     /// Total length in MiB beyond which the oldest parts are deleted; 0: none is.
     pub keep_mb: u64,
@@ -35,10 +38,6 @@ pub struct Recorder {
     pub saved_mb: u64,
     /// Conditions on which the last `save_s` seconds are saved without a request.
     pub save_on: Vec<SaveRule>,
-    /// Length of a chunk in KiB before compression.
-    pub chunk_kb: u64,
-    /// Compression of the chunks.
-    pub compression: Compression,
     /// What is recorded of the maps, beside all events.
     pub maps: RecordedMaps,
     /// True if an existing file is replaced when the new one is whole; never configured, only by `--force`.
@@ -65,16 +64,6 @@ pub enum SaveRule {
     SensorLost,
 }
 
-/// Compression of the chunks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Compression {
-    /// Zstandard, level 3.
-    Zstd,
-    /// None: for a weak processor.
-    None,
-}
-
 impl Default for Recorder {
     fn default() -> Self {
         Self {
@@ -89,8 +78,6 @@ impl Default for Recorder {
             save_s: 60,
             saved_mb: 0,
             save_on: Vec::new(),
-            chunk_kb: 1024,
-            compression: Compression::Zstd,
             maps: RecordedMaps::Full,
             replaces: false,
             awaits_store: false,
@@ -101,29 +88,15 @@ impl Default for Recorder {
 }
 
 impl Recorder {
-    /// How the files are written.
-    pub fn file_options(&self) -> McapFileOptions {
-        McapFileOptions {
-            chunk_kb: self.chunk_kb,
-            is_compressed: self.compression == Compression::Zstd,
-            maps: self.maps,
-        }
-    }
-
     pub(super) fn check(&self) -> Result<(), ValueError> {
-        if !(16..=1 << 20).contains(&self.queue) {
-            return Err(ValueError::new("recorder.queue", self.queue, "16 to 1048576 events"));
-        }
         let ranges = [
             ("recorder.flush_ms", self.flush_ms, 10..=60_000, "10 to 60000 ms"),
             ("recorder.part_mb", self.part_mb, 0..=1 << 20, "0 to 1048576 MiB"),
             ("recorder.part_s", self.part_s, 0..=86_400, "0 to 86400 s"),
-            ("recorder.warm_up_ms", self.warm_up_ms, 100..=600_000, "100 to 600000 ms"),
             ("recorder.keep_mb", self.keep_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
             ("recorder.keep_hours", self.keep_hours, 0..=876_000, "0 to 876000 h"),
             ("recorder.saved_mb", self.saved_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
             ("recorder.save_s", self.save_s, 1..=86_400, "1 to 86400 s"),
-            ("recorder.chunk_kb", self.chunk_kb, 16..=65_536, "16 to 65536 KiB"),
         ];
         for (key, value, allowed, text) in ranges {
             if !allowed.contains(&value) {

@@ -5,19 +5,11 @@ use serde::{Deserialize, Serialize};
 use super::error::ValueError;
 
 /// The table `[traces]`: where the traces of revolutions go.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Traces {
     /// An OTLP collector over gRPC, such as `http://127.0.0.1:4317`; empty: no traces.
     pub endpoint: String,
-    /// One revolution in this many is traced.
-    pub one_in: u64,
-}
-
-impl Default for Traces {
-    fn default() -> Self {
-        Self { endpoint: String::new(), one_in: 1 }
-    }
 }
 
 impl Traces {
@@ -26,9 +18,6 @@ impl Traces {
         if !self.endpoint.is_empty() && !is_address {
             let allowed = "http://HOST:PORT of an OTLP collector over gRPC";
             return Err(ValueError::new("traces.endpoint", &self.endpoint, allowed));
-        }
-        if self.one_in == 0 {
-            return Err(ValueError::new("traces.one_in", self.one_in, "1 or more"));
         }
         Ok(())
     }

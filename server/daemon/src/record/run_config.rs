@@ -57,7 +57,10 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
 }
 
 /// Keys of `[vehicle.maps]` that earlier versions had and that are constants now: table, key, value.
-const CONSTANTS: [(&str, &str, &str); 54] = [
+const CONSTANTS: [(&str, &str, &str); 57] = [
+    ("height_difference", "range_m_max", "60"),
+    ("height_difference", "columns", "360"),
+    ("speed", "outside_corridor_mps", "0"),
     ("speed", "step_m_max", "0.2"),
     ("speed", "grade_max", "0.2"),
     ("speed", "smooth_m", "0.03"),
@@ -115,17 +118,22 @@ const CONSTANTS: [(&str, &str, &str); 54] = [
 ];
 
 /// Keys of other tables that earlier versions had. They changed no map.
-const REMOVED: [(&str, &str); 0] = [];
+const REMOVED: [(&str, &str); 7] = [
+    ("recorder", "queue"),
+    ("recorder", "warm_up_ms"),
+    ("recorder", "chunk_kb"),
+    ("recorder", "compression"),
+    ("traces", "one_in"),
+    ("connections", "idle_s"),
+    ("connections", "stalled_s"),
+];
 
 /// The text of a recorded configuration without the keys that this version does not have, and a sentence for each of
 /// them whose recorded value is not the constant of this version.
 fn without_removed_keys(text: &str) -> (String, Vec<String>) {
     let Ok(mut document) = text.parse::<toml::Table>() else { return (text.to_owned(), Vec::new()) };
     for (table, key) in REMOVED {
-        let mut tables = table.split('.');
-        let first = tables.next().and_then(|name| document.get_mut(name));
-        let found = tables.fold(first, |value, name| value.and_then(|value| value.get_mut(name)));
-        if let Some(table) = found.and_then(toml::Value::as_table_mut) {
+        if let Some(table) = document.get_mut(table).and_then(toml::Value::as_table_mut) {
             table.remove(key);
         }
     }
@@ -178,6 +186,7 @@ mod tests {
         let speed = document["vehicle"][0]["maps"]["speed"].as_table_mut().unwrap();
         speed.insert("smooth_m".into(), 0.03.into());
         speed.insert("rough_m".into(), 0.25.into());
+        document["recorder"].as_table_mut().unwrap().insert("chunk_kb".into(), 16.into());
         let (text, changed) = without_removed_keys(&document.to_string());
         assert_eq!(changed, ["vehicle.maps.speed.rough_m = 0.25 is the constant 0.15 now"]);
         Config::parse(&text, Path::new("config.toml"), &[]).unwrap();

@@ -393,7 +393,7 @@ impl<F: Files> RecordingWriter<F> {
         let path = self.files.path(number);
         let create = |source| RecordError::Create { file: path.clone(), source };
         let disk = self.files.create(number).map_err(create)?;
-        let written = McapFile::create(disk, self.options.file_options(), &self.header, number);
+        let written = McapFile::create(disk, self.options.maps, &self.header, number);
         // A file without a whole header is of no use; once it is deleted, its number is free again.
         let is_free = written.is_err() && self.files.discard(number).is_ok();
         self.newest_part = if is_free { self.newest_part } else { number };

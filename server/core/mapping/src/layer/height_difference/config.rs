@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::value_check::{ConfigValueError, check_columns, check_each};
+use crate::value_check::{ConfigValueError, check_each};
 
 /// Parameters of the layer `height_difference`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -11,11 +11,13 @@ pub struct HeightDifferenceConfig {
     /// True if the layer is made.
     pub enabled: bool,
     /// Largest horizontal range of a point, metres; the outermost row ends here. 60: UT Austin thesis, section IV.1.
+    #[serde(skip)]
     pub range_m_max: f32,
     /// Largest height difference between the points of a drivable cell, metres. 0.25 is ours, one unit of the layer
     /// `drivability`, because the thesis gives no value (section V); not tuned.
     pub difference_m_max: f32,
     /// Number of columns of the grid. 360 (one degree each): UT Austin thesis, section IV.1.
+    #[serde(skip)]
     pub columns: u16,
 }
 
@@ -31,11 +33,6 @@ impl HeightDifferenceConfig {
     /// # Errors
     /// [`ConfigValueError`] for the first value that is not allowed.
     pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
-        let values = [
-            ("range_m_max", self.range_m_max, (5.0..=200.0, "5 to 200")),
-            ("difference_m_max", self.difference_m_max, (0.01..=10.0, "0.01 to 10")),
-        ];
-        check_each(at, values)?;
-        check_columns(at, self.columns)
+        check_each(at, [("difference_m_max", self.difference_m_max, (0.01..=10.0, "0.01 to 10"))])
     }
 }

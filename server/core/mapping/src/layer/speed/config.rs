@@ -84,9 +84,6 @@ pub struct SpeedConfig {
     /// an RDDF (Lindström 2005, section 3.2.1).
     #[serde(skip)]
     pub corridor: bool,
-    /// Speed limit outside the corridor of the route, m/s; 0: no limit. 0 is ours, because a route may lie beside the
-    /// road by the error of the positions.
-    pub outside_corridor_mps: f32,
     /// True if the speed limits of the route cap the speed in their part of its corridor. `true` is ours, because the
     /// rules of the race demand it; the paper reads the same file for its curvature alone.
     #[serde(skip)]
@@ -108,7 +105,6 @@ impl Default for SpeedConfig {
             bonus: Bonus::Relative,
             measure_road: false,
             corridor: true,
-            outside_corridor_mps: 0.0,
             speed_limits: true,
         }
     }
@@ -135,7 +131,6 @@ impl SpeedConfig {
         let values = [
             ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
-            ("outside_corridor_mps", self.outside_corridor_mps, (0.0..=60.0, "0 to 60")),
             // A cell has 8 bits in steps of 0.25 m/s, and 0 is an obstacle.
             ("unknown_mps", self.unknown_mps, (0.25..=10.0, "0.25 to 10")),
             ("crawl_mps", self.crawl_mps, (0.5..=20.0, "0.5 to 20")),

@@ -101,11 +101,9 @@ impl Speed {
 
     /// A speed with the limits of the route; `limit_mps` is that of the cell in the corridor.
     fn limited_mps(&self, mps: f32, limit_mps: f32) -> f32 {
-        let SpeedConfig { speed_limits, outside_corridor_mps, .. } = self.config;
         match limit_mps {
-            OUTSIDE if outside_corridor_mps > 0.0 => mps.min(outside_corridor_mps),
             OUTSIDE => mps,
-            limit_mps if speed_limits => mps.min(limit_mps),
+            limit_mps if self.config.speed_limits => mps.min(limit_mps),
             _ => mps,
         }
     }

@@ -17,9 +17,6 @@ fn a_road_outside_the_corridor_of_the_route_has_no_bonus() {
     };
     assert_eq!([0.6, 2.6, 3.6].map(|y| at(&layer, y)), [(ROAD, 18.0), (ROAD, 18.0), (PASSABLE, 10.0)]);
     assert_eq!([-0.6, -2.6].map(|y| at(&layer, y)), [(PASSABLE, 10.0); 2]);
-    let limited = SpeedConfig { outside_corridor_mps: 3.0, ..fine(Bonus::Uniform) };
-    let layer = make(&limited, &sweep, &context(&narrow));
-    assert_eq!([0.6, -0.6, 5.6].map(|y| at(&layer, y)), [(ROAD, 18.0), (PASSABLE, 3.0), (PASSABLE, 3.0)]);
     let open = SpeedConfig { corridor: false, ..fine(Bonus::Uniform) };
     assert_eq!(at(&make(&open, &sweep, &context(&narrow)), -0.6), (ROAD, 18.0));
 }
