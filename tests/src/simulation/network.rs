@@ -1,11 +1,9 @@
 //! The networks between the car's sensors and the server: what the sensors send, with their faults, until it arrives.
 
 use bytes::Bytes;
-use clearway_daemon::ingest::engine_time::EngineTime;
 use clearway_daemon::ingest::udp::DATAGRAM_BYTES_MAX;
 use clearway_mapping::event::{Body, Cause};
 use clearway_sim::vehicle::Datagram;
-use prost::Message;
 use std::sync::atomic::Ordering;
 
 use super::drive::Reading;
@@ -140,16 +138,13 @@ impl TestBed<'_> {
                 self.session.record_outcome(id.number, outcome);
             }
         }
-        let limits = &self.gateway.limits;
-        while self.session.has_credit(self.gateway.in_flight_max, limits.message_bytes_max) {
+        while self.session.has_credit(self.gateway.in_flight_max) {
             let Some(mut observation) = self.waiting.pop_front() else { break };
             self.observations += 1;
             observation.number = self.observations;
             self.offered += 1;
-            let bytes = observation.encoded_len();
             // An unknown sensor ends a real stream; its car connects again.
-            let time = EngineTime::default();
-            let _ = self.gateway.push(observation, bytes, time, &mut self.session, &self.outcome_sender);
+            let _ = self.gateway.push(observation, None, &mut self.session, &self.outcome_sender);
         }
     }
 }

@@ -70,7 +70,7 @@ impl TestBed<'_> {
         adds_up("at the end, the core", self.engine.pipeline.ledger())?;
         self.observe();
         if !self.session.is_idle() || !self.waiting.is_empty() {
-            let (events, _) = self.session.in_flight();
+            let events = self.session.events();
             let found = format!("{events} events without an outcome, {} observations still wait", self.waiting.len());
             return Err(violation("outcomes", found));
         }

@@ -130,7 +130,7 @@ impl<'a> TestBed<'a> {
             drive,
             now_ns: 0,
             clock,
-            gateway: Gateway::new(vehicle, &queue, Arc::default()),
+            gateway: Gateway::new(vehicle, &queue),
             queue,
             events,
             engine,

@@ -146,19 +146,18 @@ async fn points_at_impossible_positions_are_counted_and_dropped() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_scan_whose_map_would_be_late_is_refused_and_one_sender_never_has_all_streams() {
+async fn a_scan_that_is_too_large_is_refused_and_one_sender_never_has_all_streams() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = scanned_config();
     config.vehicles[0].ingest.streams_max = 3;
-    config.vehicles[0].maps.valid_ms = 60;
+    config.vehicles[0].ingest.points_max = 300_000;
     let running = start(config, &folder.path().join("r.mcap")).await;
     let floats: Bytes = vec![0; 4 * 400_000].into();
     let large = v1::Scan { stamp_ns: 1, x: floats.clone(), y: floats.clone(), z: floats, ..Default::default() };
-    // Before the first map the server counts on 0.1 ms for each thousand points.
     let (reports, end) = reports(&running, vec![scan(1, large), scan(2, plain(100_000_000))]).await;
     let refusals: Vec<_> = reports.iter().flat_map(|report| &report.refused).collect();
-    assert!(end.is_none() && refusals.len() == 1 && refusals[0].reason == "scan_time", "{refusals:?} {end:?}");
-    assert!(refusals[0].message.contains("400000 points") && refusals[0].message.contains("up to 30 ms"));
+    assert!(end.is_none() && refusals.len() == 1 && refusals[0].reason == "points", "{refusals:?} {end:?}");
+    assert!(refusals[0].message.contains("400000 points") && refusals[0].message.contains("up to 300000"));
     let status = running.vehicles.0[0].status.snapshot();
     assert_eq!((status.ledger.refused.get("observation"), status.ledger.decoded), (Some(&1), 1));
 

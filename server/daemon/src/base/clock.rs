@@ -3,9 +3,7 @@
 
 use std::fmt;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
-
-use nix::time::{ClockId, clock_gettime};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 /// The system's time, ns since the Unix epoch.
 pub fn now_ns() -> i64 {
@@ -13,29 +11,6 @@ pub fn now_ns() -> i64 {
         Ok(since) => i64::try_from(since.as_nanos()).unwrap_or(i64::MAX),
         Err(before) => -i64::try_from(before.duration().as_nanos()).unwrap_or(i64::MAX),
     }
-}
-
-/// How long a thread has had a processor since a start. Reading it is a system call.
-#[derive(Clone, Copy, Debug)]
-pub struct WorkTime {
-    before: Duration,
-}
-
-impl WorkTime {
-    /// Starts in the calling thread, which reads it too.
-    pub fn start() -> Self {
-        Self { before: thread_time() }
-    }
-
-    /// The time for which the thread has had a processor since the start.
-    pub fn worked(&self) -> Duration {
-        thread_time().saturating_sub(self.before)
-    }
-}
-
-/// The time for which the calling thread has had a processor; zero if the system does not tell.
-fn thread_time() -> Duration {
-    clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map_or(Duration::ZERO, Duration::from)
 }
 
 /// A source of the time, ns since the Unix epoch: the system's by default, or the simulated time of a test.

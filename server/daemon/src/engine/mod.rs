@@ -8,12 +8,12 @@
 //! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`subscriptions`] | readers -> layers to compute |
 //! | [`acknowledgements`] | readers that acknowledge -> the maps that they have finished with |
-//! | [`turns`] | engines with events -> those that work at once |
+//! | [`compute_permits`] | engines with events -> the engines that compute at once |
 
 pub mod acknowledgements;
+pub mod compute_permits;
 pub mod newest;
 pub mod subscriptions;
-pub mod turns;
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
@@ -21,15 +21,15 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use clearway_mapping::error::EventError;
-use clearway_mapping::event::{Body, EgoPose, Event};
+use clearway_mapping::event::{EgoPose, Event};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use nalgebra::Vector3;
 use tokio::sync::watch;
 
-use crate::base::clock::{WorkTime, now_ns};
+use crate::base::clock::now_ns;
+use crate::engine::compute_permits::{ComputePermit, ComputePermits};
 use crate::engine::newest::Newest;
-use crate::engine::turns::{Turn, Turns};
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::receipt::Outcome;
 use crate::record::writer::RecordingHandle;
@@ -42,19 +42,6 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A function that is called with the pipeline after each event that completed a revolution.
 pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
-
-/// What a turn has taken so far.
-struct TurnWork {
-    time: WorkTime,
-    /// Rays of its scans, with a return or without.
-    rays: usize,
-}
-
-impl TurnWork {
-    fn start() -> Self {
-        Self { time: WorkTime::start(), rays: 0 }
-    }
-}
 
 /// One vehicle's engine before its thread runs.
 pub struct Engine {
@@ -75,46 +62,31 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// Starts the thread, which works in `turns`. It ends when the vehicle's queue is closed and empty.
+    /// Starts the thread, which computes with a permit of `permits`. It ends when the vehicle's queue is closed and empty.
     ///
     /// # Errors
     /// [`std::io::Error`] if the system cannot create a thread.
-    pub fn start(mut self, events: Receiver<QueuedEvent>, turns: Arc<Turns>) -> std::io::Result<JoinHandle<()>> {
+    pub fn start(
+        mut self,
+        events: Receiver<QueuedEvent>,
+        permits: Arc<ComputePermits>,
+    ) -> std::io::Result<JoinHandle<()>> {
         std::thread::Builder::new().name(format!("engine {}", self.status.name)).spawn(move || {
-            // Marks the engine as stopped also if the thread panics.
-            struct Stopped(Arc<VehicleStatus>);
-            impl Drop for Stopped {
-                fn drop(&mut self) {
-                    self.0.engine_stopped();
-                }
-            }
-            let _stopped = Stopped(self.status.clone());
             self.status.engine_beats();
-            let (mut turn, mut work) = (None, TurnWork::start());
-            while let Some(queued) = self.next(&events, &mut turn) {
+            let mut permit = None;
+            while let Some(queued) = self.next(&events, &mut permit) {
                 self.status.engine_beats();
-                turn = turn.or_else(|| {
-                    work = TurnWork::start();
-                    Some(turns.wait())
-                });
+                permit.get_or_insert_with(|| permits.acquire());
                 let maps = self.maps();
-                self.step_in_turn(queued, &mut work);
-                turn = turn.filter(|_| self.maps() == maps);
+                self.step(queued);
+                permit.take_if(|_| self.maps() != maps);
             }
         })
     }
 
     /// Handles one event in the calling thread.
-    pub fn step(&mut self, queued: QueuedEvent) {
-        self.step_in_turn(queued, &mut TurnWork::start());
-    }
-
-    /// Handles one event of a turn.
-    fn step_in_turn(&mut self, QueuedEvent { event, receipt, .. }: QueuedEvent, work: &mut TurnWork) {
-        if let Body::Scan(scan) = &event.body {
-            work.rays += scan.x.len() + scan.no_returns.len();
-        }
-        let outcome = self.step_event(&event, work);
+    pub fn step(&mut self, QueuedEvent { event, receipt, .. }: QueuedEvent) {
+        let outcome = self.step_event(&event);
         // After everything else: a client that receives the outcome finds the map published and counted.
         if let Some(receipt) = receipt {
             self.update_status();
@@ -141,7 +113,7 @@ impl Engine {
             self.newest.send_replace(None);
             self.status.sweeps.send_replace(None);
         }
-        self.publish(Instant::now(), None, None);
+        self.publish(Instant::now(), None);
     }
 
     /// Copies the ledger and the sensors into the status; the thread of [`Engine::start`] does so whenever no event
@@ -152,14 +124,14 @@ impl Engine {
         self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors(), pose);
     }
 
-    /// Waits for the next event; `None` once the queue is closed and empty. Updates the status and ends the turn before
-    /// it waits.
-    fn next(&mut self, events: &Receiver<QueuedEvent>, turn: &mut Option<Turn<'_>>) -> Option<QueuedEvent> {
+    /// Waits for the next event; `None` once the queue is closed and empty. Updates the status and releases the
+    /// permit before it waits.
+    fn next(&mut self, events: &Receiver<QueuedEvent>, permit: &mut Option<ComputePermit<'_>>) -> Option<QueuedEvent> {
         match events.try_recv() {
             Ok(queued) => return Some(queued),
             Err(TryRecvError::Empty | TryRecvError::Disconnected) => self.update_status(),
         }
-        *turn = None;
+        *permit = None;
         loop {
             match events.recv_timeout(POLL_INTERVAL) {
                 Ok(queued) => return Some(queued),
@@ -183,11 +155,11 @@ impl Engine {
         let began = Instant::now();
         self.update_layers();
         if self.pipeline.remake_newest_map().is_some() {
-            self.publish(began, None, None);
+            self.publish(began, None);
         }
     }
 
-    fn step_event(&mut self, event: &Event, work: &TurnWork) -> Result<(), EventError> {
+    fn step_event(&mut self, event: &Event) -> Result<(), EventError> {
         if let Some(recording) = &mut self.recording {
             recording.record_event(event);
         }
@@ -195,7 +167,7 @@ impl Engine {
         self.update_layers();
         let outcome = self.pipeline.step(event).map(|map| map.is_some());
         match &outcome {
-            Ok(true) => self.publish(began, Some(work), waited),
+            Ok(true) => self.publish(began, waited),
             Ok(false) => {}
             Err(error) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
@@ -209,8 +181,8 @@ impl Engine {
     }
 
     /// Encodes the newest map and gives it to readers, recorder and observer. Its computation `began` after its event
-    /// had `waited`; `work` is that of its turn so far. Both are `None` if no event made the map.
-    fn publish(&mut self, began: Instant, work: Option<&TurnWork>, waited: Option<Duration>) {
+    /// had `waited`; `None` if no event made the map.
+    fn publish(&mut self, began: Instant, waited: Option<Duration>) {
         let computed = began.elapsed();
         let Some(map) = self.pipeline.newest_map() else { return };
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
@@ -220,10 +192,6 @@ impl Engine {
             (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
         });
         let encoding = began.elapsed().saturating_sub(computed);
-        if let Some(work) = work {
-            let points = self.pipeline.newest_sweep().x.len().max(work.rays);
-            self.status.map_time.record(points, work.time.worked());
-        }
         let speed_m_s = map.speed_mps;
         // The points come before the map, so that a reader of the map finds its points.
         if self.status.sweeps.receiver_count() > 0 {

@@ -4,7 +4,7 @@
 //! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine
 //! returns the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as
 //! few reports as the transport can send. It runs in a task of its own, so that a peer that takes no reports keeps
-//! neither the engine's time nor an event.
+//! neither a permit nor an event.
 
 use std::error::Error;
 use std::net::Ipv4Addr;
@@ -13,15 +13,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clearway_proto::v1;
-use futures::{Stream, stream};
-use prost::Message;
+use futures::future::{BoxFuture, OptionFuture};
+use futures::{FutureExt, Stream, stream};
 use tokio::sync::mpsc::{self, UnboundedReceiver, channel, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
-use super::engine_time::{EngineTime, Sender, Waiting};
+use super::admission::{AdmissionPermit, OpenStream};
 use super::gateway::{Gateway, Gateways};
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
-use super::stream_places::StreamPlace;
 use crate::publish::listen::CallPermit;
 use crate::publish::listen::access::Caller;
 
@@ -63,7 +62,7 @@ impl IngestService for Ingest {
             slot.as_ref().inspect(|slot| slot.count("streams"));
             Status::resource_exhausted(format!("{of}: {error}; close one first"))
         };
-        let unnamed = self.gateways.take_unnamed_stream(host);
+        let unnamed = self.gateways.open_unnamed_stream(host);
         let unnamed = unnamed.map_err(|error| full("streams that have not named their vehicle", error))?;
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
@@ -77,16 +76,15 @@ impl IngestService for Ingest {
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let gateway = self.gateways.find(&first.vehicle)?.clone();
         caller.check_vehicle(&gateway.vehicle)?;
-        let place = gateway.take_stream(host);
-        let place = place.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
+        let open = gateway.open_stream(host);
+        let open = open.map_err(|error| full(&format!("vehicle {}", gateway.vehicle), error))?;
         drop(unnamed);
-        let sender = gateway.time.sender_at(host);
         let session = ClientSession::of_sender(0, &gateway.name_stream(host));
-        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), sender, session, place);
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), session, open);
         if first.body.is_none() {
             stream.acknowledge_opening(&first);
         } else {
-            stream.wait_for_time(first);
+            stream.wait_for_admission(first);
         }
         let (report_sender, mut reports) = channel(1);
         tokio::spawn(stream.run(report_sender));
@@ -98,8 +96,8 @@ impl IngestService for Ingest {
 struct IngestStream {
     /// `None` once the stream reads no more observations.
     observations: Option<Streaming<v1::Observation>>,
-    waiting: Option<Waiting>,
-    sender: Sender,
+    /// The observation that is not admitted yet.
+    waiting: Option<BoxFuture<'static, (v1::Observation, AdmissionPermit)>>,
     gateway: Arc<Gateway>,
     gateways: Gateways,
     session: ClientSession,
@@ -108,7 +106,7 @@ struct IngestStream {
     /// The status that ends the stream, after everything in flight is reported.
     end: Option<Status>,
     // The last field, so that it is dropped last.
-    _place: StreamPlace,
+    _open: OpenStream,
 }
 
 impl IngestStream {
@@ -116,22 +114,20 @@ impl IngestStream {
         observations: Streaming<v1::Observation>,
         gateway: Arc<Gateway>,
         gateways: Gateways,
-        sender: Sender,
         session: ClientSession,
-        place: StreamPlace,
+        open: OpenStream,
     ) -> Self {
         let (outcome_sender, outcomes) = unbounded_channel();
         Self {
             observations: Some(observations),
             waiting: None,
-            sender,
             gateway,
             gateways,
             session,
             outcome_sender,
             outcomes,
             end: None,
-            _place: place,
+            _open: open,
         }
     }
 
@@ -150,8 +146,8 @@ impl IngestStream {
                 }
                 return;
             }
-            let (events_max, bytes_max) = (self.gateway.in_flight_max, self.gateway.limits.message_bytes_max);
-            let has_credit = !has_report && self.waiting.is_none() && self.session.has_credit(events_max, bytes_max);
+            let has_credit =
+                !has_report && self.waiting.is_none() && self.session.has_credit(self.gateway.in_flight_max);
             tokio::select! {
                 // Outcomes first, because they give credit.
                 biased;
@@ -165,9 +161,9 @@ impl IngestStream {
                 () = self.gateways.stopped(), if self.observations.is_some() => {
                     self.stop_reading(Some(Status::unavailable("the server stops")));
                 }
-                time = Waiting::time(&mut self.waiting), if self.waiting.is_some() => self.push_waiting(time),
+                Some((observation, permit)) = OptionFuture::from(self.waiting.as_mut()) => self.push(observation, permit),
                 observation = next_observation(&mut self.observations), if has_credit => match observation {
-                    Ok(Some(observation)) => self.wait_for_time(observation),
+                    Ok(Some(observation)) => self.wait_for_admission(observation),
                     Ok(None) => self.stop_reading(None),
                     Err(status) => {
                         if is_refusal(&status) {
@@ -184,18 +180,24 @@ impl IngestStream {
     fn acknowledge_opening(&mut self, first: &v1::Observation) {
         // A first number is always valid.
         let _ = self.session.check_number(first.number);
-        self.session.begin(first.number, 0, 0);
+        self.session.begin(first.number, 0);
     }
 
-    fn wait_for_time(&mut self, mut observation: v1::Observation) {
+    fn wait_for_admission(&mut self, mut observation: v1::Observation) {
+        use v1::observation::Body::{EgoPose, End};
         observation.client = 0;
-        let bytes = observation.encoded_len();
-        self.waiting = Some(self.gateway.time.wait(observation, bytes, &self.sender));
+        let gateway = self.gateway.clone();
+        let admitting = async move {
+            let is_light = matches!(observation.body, None | Some(EgoPose(_) | End(_)));
+            let permit = gateway.admission.admit(is_light).await;
+            (observation, permit)
+        };
+        self.waiting = Some(admitting.boxed());
     }
 
-    fn push_waiting(&mut self, time: EngineTime) {
-        let Some(Waiting { observation, bytes, .. }) = self.waiting.take() else { return };
-        if let Err(unknown) = self.gateway.push(observation, bytes, time, &mut self.session, &self.outcome_sender) {
+    fn push(&mut self, observation: v1::Observation, permit: AdmissionPermit) {
+        self.waiting = None;
+        if let Err(unknown) = self.gateway.push(observation, permit, &mut self.session, &self.outcome_sender) {
             self.stop_reading(Some(unknown.into()));
         }
     }

@@ -8,8 +8,7 @@
 //! | `zenoh_source` | the queue of one source -> gateway; reports back |
 //! | [`gateway`] | one observation of a client -> events on the queue of its vehicle |
 //! | [`observation`] | `clearway.v1.Observation` -> event bodies, or the reason of the refusal |
-//! | [`stream_places`] | streams of senders -> places: so many at once, and never all for one sender |
-//! | [`engine_time`] | observations with points -> those that the engine has time for, by turns of their senders |
+//! | [`admission`] | streams and observations -> those that are admitted now, by turns of their sources |
 //! | [`receipt`] | outcome of an event -> report to its client |
 //! | [`ros`] | ROS 2 messages, live or from a file -> readings |
 //! | [`files`] | captures, MCAP files, scans -> readings |
@@ -17,8 +16,8 @@
 //! | [`sensor_senders`] | who sends the data of each sensor, to tell when several do at once |
 //! | [`drops`] | counts of readings that did not become events |
 
+pub mod admission;
 pub mod drops;
-pub mod engine_time;
 pub mod files;
 pub mod gateway;
 pub mod grpc;
@@ -27,7 +26,6 @@ pub mod queue;
 pub mod receipt;
 pub mod ros;
 pub mod sensor_senders;
-pub mod stream_places;
 pub mod udp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

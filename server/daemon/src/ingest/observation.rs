@@ -4,8 +4,6 @@
 //! than the message. The core checks the rest (stamps, poses, roads, lists of different lengths), so that the journal
 //! contains those refusals.
 
-use std::time::Duration;
-
 use bytes::Bytes;
 use clearway_mapping::event::Body;
 use clearway_proto::packed::unpack;
@@ -128,23 +126,6 @@ pub enum ObservationError {
         /// [`Limits::ahead_ns_max`].
         ahead_ns_max: i64,
     },
-    /// A map of the scan would be late.
-    #[error(
-        "scan with {points} points, beside {others} of other sensors: a map of them takes {} ms; up to {} ms are \
-         allowed, half of maps.valid_ms",
-        .takes.as_millis(),
-        .takes_max.as_millis()
-    )]
-    Time {
-        /// Number of points.
-        points: usize,
-        /// Number of points of the newest scans of the vehicle's other sensors.
-        others: usize,
-        /// How long a map takes, by the times of the maps before.
-        takes: Duration,
-        /// Longest time that is allowed.
-        takes_max: Duration,
-    },
     /// A required field is missing.
     #[error("{body} without {what}")]
     Missing {
@@ -167,7 +148,6 @@ impl ObservationError {
             Self::Columns { .. } => "columns",
             Self::Packets { .. } => "packets",
             Self::StampAhead { .. } => "stamp_ahead",
-            Self::Time { .. } => "scan_time",
             Self::Missing { .. } => "missing",
         }
     }

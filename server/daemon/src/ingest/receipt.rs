@@ -7,7 +7,7 @@ use clearway_mapping::error::EventError;
 use clearway_proto::v1;
 use tokio::sync::mpsc::UnboundedSender;
 
-use super::engine_time::EngineTime;
+use super::admission::AdmissionPermit;
 use super::sensor_senders::SensorSender;
 
 /// The outcome of one event.
@@ -51,13 +51,13 @@ pub type OutcomeSender = UnboundedSender<(ObservationId, Outcome)>;
 pub struct Receipt {
     id: ObservationId,
     outcomes: Option<OutcomeSender>,
-    _time: EngineTime,
+    _permit: AdmissionPermit,
 }
 
 impl Receipt {
-    /// A receipt for one event of the observation `id`, which holds `time` until then.
-    pub fn new(id: ObservationId, time: EngineTime, outcomes: &OutcomeSender) -> Self {
-        Self { id, outcomes: Some(outcomes.clone()), _time: time }
+    /// A receipt for one event of the observation `id`, which holds `permit` until then.
+    pub fn new(id: ObservationId, permit: AdmissionPermit, outcomes: &OutcomeSender) -> Self {
+        Self { id, outcomes: Some(outcomes.clone()), _permit: permit }
     }
 
     /// Delivers the outcome.
@@ -101,8 +101,6 @@ pub struct ClientSession {
     in_flight: VecDeque<InFlight>,
     /// Events in flight.
     events: usize,
-    /// Bytes of the observations in flight.
-    bytes: usize,
     acknowledged: u64,
     /// The acknowledgement of the last report.
     reported: Option<u64>,
@@ -115,7 +113,6 @@ pub struct ClientSession {
 struct InFlight {
     number: u64,
     events_left: usize,
-    bytes: usize,
 }
 
 impl ClientSession {
@@ -149,10 +146,9 @@ impl ClientSession {
         self.in_flight.is_empty()
     }
 
-    /// True if another observation may be read: fewer than `events_max` events and `bytes_max` bytes are in flight, or
-    /// no observation at all.
-    pub fn has_credit(&self, events_max: usize, bytes_max: usize) -> bool {
-        self.is_idle() || (self.events < events_max && self.bytes < bytes_max)
+    /// True if another observation may be read: fewer than `events_max` events are in flight, or no observation.
+    pub fn has_credit(&self, events_max: usize) -> bool {
+        self.is_idle() || self.events < events_max
     }
 
     /// Checks the number of the next observation and remembers it.
@@ -169,12 +165,10 @@ impl ClientSession {
         }
     }
 
-    /// Puts an observation of so many events and bytes in flight. [`ClientSession::record_outcome`] follows for each
-    /// event.
-    pub fn begin(&mut self, number: u64, events: usize, bytes: usize) {
+    /// Puts an observation of so many events in flight. [`ClientSession::record_outcome`] follows for each event.
+    pub fn begin(&mut self, number: u64, events: usize) {
         self.events += events;
-        self.bytes += bytes;
-        self.in_flight.push_back(InFlight { number, events_left: events, bytes });
+        self.in_flight.push_back(InFlight { number, events_left: events });
         self.acknowledge_finished();
     }
 
@@ -201,14 +195,13 @@ impl ClientSession {
 
     fn acknowledge_finished(&mut self) {
         while let Some(first) = self.in_flight.pop_front_if(|observation| observation.events_left == 0) {
-            self.bytes -= first.bytes;
             self.acknowledged = first.number;
         }
     }
 
-    /// Number of events and of bytes in flight.
-    pub fn in_flight(&self) -> (usize, usize) {
-        (self.events, self.bytes)
+    /// Number of events in flight.
+    pub fn events(&self) -> usize {
+        self.events
     }
 
     /// Refuses the numbers between the newest one and `number` as `missed`: no observation with them arrived.
@@ -217,8 +210,10 @@ impl ClientSession {
             && number > first
         {
             let missed = number - first;
-            let message =
-                format!("{missed} observations from number {first} on never came, or found the server's queue full");
+            let message = format!(
+                "{missed} observations from number {first} on never came, or found the server's queue full, or waited \
+                 there when a newer scan came"
+            );
             self.refuse(first, "missed", message, missed);
         }
     }
@@ -255,8 +250,8 @@ mod tests {
     #[test]
     fn an_observation_is_acknowledged_after_its_last_event_and_all_before_it() {
         let mut session = ClientSession::new(7);
-        session.begin(1, 2, 100);
-        session.begin(4, 1, 50);
+        session.begin(1, 2);
+        session.begin(4, 1);
         session.record_outcome(4, refused("stamp"));
         session.record_outcome(1, Outcome::Accepted);
         let report = session.next_report().unwrap();
@@ -265,13 +260,13 @@ mod tests {
         assert!(session.next_report().is_none(), "nothing is reported twice");
         session.record_outcome(1, Outcome::Accepted);
         assert_eq!(session.next_report().unwrap().acknowledged, 4);
-        assert!(session.is_idle() && session.bytes == 0 && session.events == 0);
+        assert!(session.is_idle() && session.events == 0);
     }
 
     #[test]
     fn datagrams_refused_for_one_reason_become_one_refusal_with_their_count() {
         let mut session = ClientSession::new(0);
-        session.begin(1, 3, 9);
+        session.begin(1, 3);
         for reason in ["length", "azimuth", "length"] {
             session.record_outcome(1, refused(reason));
         }
@@ -284,10 +279,10 @@ mod tests {
     #[test]
     fn one_observation_always_has_credit_and_more_have_it_within_the_limits() {
         let mut session = ClientSession::new(0);
-        session.begin(1, 100, 1000);
-        assert!(!session.has_credit(100, 10_000) && !session.has_credit(1000, 1000) && session.has_credit(101, 1001));
+        session.begin(1, 100);
+        assert!(!session.has_credit(100) && session.has_credit(101));
         (0..100).for_each(|_| session.record_outcome(1, Outcome::Accepted));
-        assert!(session.has_credit(1, 1));
+        assert!(session.has_credit(1));
     }
 
     #[test]
@@ -302,8 +297,8 @@ mod tests {
     fn a_receipt_that_is_dropped_delivers_that_the_engine_has_stopped() {
         let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
         let id = ObservationId { client: 1, number: 2 };
-        drop(Receipt::new(id, EngineTime::default(), &sender));
-        Receipt::new(id, EngineTime::default(), &sender).deliver(Outcome::Accepted);
+        drop(Receipt::new(id, None, &sender));
+        Receipt::new(id, None, &sender).deliver(Outcome::Accepted);
         assert!(matches!(outcomes.try_recv(), Ok((of, Outcome::Refused { reason: "stopped", .. })) if of == id));
         assert_eq!(outcomes.try_recv(), Ok((id, Outcome::Accepted)));
         assert!(outcomes.try_recv().is_err(), "each is delivered once");

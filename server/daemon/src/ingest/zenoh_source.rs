@@ -1,24 +1,29 @@
 //! The observations of one zenoh session for one vehicle -> the vehicle's gateway, and reports back.
 
+use std::pin::pin;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use clearway_proto::v1;
+use futures::{StreamExt, stream};
 use prost::Message;
 use tokio::sync::Mutex;
-use tokio::sync::mpsc::{Receiver, unbounded_channel};
+use tokio::sync::mpsc::unbounded_channel;
 use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
 use zenoh::session::ZenohId;
 
-use super::engine_time::{EngineTime, Sender, Waiting};
+use super::admission::{AdmissionPermit, SourceQueue};
 use super::gateway::Gateway;
 use super::observation::ObservationError;
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 use crate::zenoh_session::Senders;
 
+/// Greatest number of sources of one vehicle. A new source replaces the longest silent source without queued samples.
+/// Ours: the sensors of a vehicle seldom have more than one session each.
+pub(super) const SOURCES_MAX: usize = 16;
 /// Greatest number of clients of one source that are remembered. A new client replaces the idle client that was silent
 /// longest.
 const CLIENTS_MAX: usize = 64;
@@ -30,34 +35,11 @@ const REPEAT: (Duration, u32) = (Duration::from_secs(1), 10);
 pub(super) const SILENT_MAX: Duration = Duration::from_secs(600);
 
 /// A sample that is not decoded yet.
-pub(super) struct QueuedSample {
-    /// The key after `clearway/<vehicle>/ingest/`.
-    pub key: String,
+pub(super) struct Sample {
     /// Empty if it is too long.
     pub payload: ZBytes,
     /// Length of the payload as it came.
     pub length: usize,
-    pub queued: QueuedBytes,
-}
-
-/// Bytes of one sample that are queued until this is dropped.
-pub(super) struct QueuedBytes {
-    bytes: usize,
-    /// The counts of its source and of its vehicle.
-    counts: [Arc<AtomicUsize>; 2],
-}
-
-impl QueuedBytes {
-    pub fn new(bytes: usize, counts: [Arc<AtomicUsize>; 2]) -> Self {
-        counts.iter().for_each(|count| _ = count.fetch_add(bytes, Ordering::Relaxed));
-        Self { bytes, counts }
-    }
-}
-
-impl Drop for QueuedBytes {
-    fn drop(&mut self) {
-        self.counts.iter().for_each(|count| _ = count.fetch_sub(self.bytes, Ordering::Relaxed));
-    }
 }
 
 /// What all sources of a vehicle have in common.
@@ -71,38 +53,29 @@ pub(super) struct Common {
 /// One source: a zenoh session, as its samples state; or all sessions whose samples state none.
 pub(super) struct Source {
     id: Option<ZenohId>,
-    samples: Receiver<QueuedSample>,
-    /// Number of sources of the vehicle.
-    sources: Arc<AtomicUsize>,
+    samples: Arc<SourceQueue<Sample>>,
     /// True if an observation was accepted.
     is_accepted: Arc<AtomicBool>,
-    sender: Sender,
     clients: Clients,
-    /// The observation that waits for the engine's time, and its bytes.
-    waiting: Option<Waiting>,
-    waiting_bytes: Option<QueuedBytes>,
 }
 
 impl Source {
-    /// A source of the vehicle's `sources`, whose samples come through this channel until it is closed.
-    pub fn new(
-        id: Option<ZenohId>,
-        samples: Receiver<QueuedSample>,
-        sources: Arc<AtomicUsize>,
-        is_accepted: Arc<AtomicBool>,
-        sender: Sender,
-    ) -> Self {
-        let (clients, waiting, waiting_bytes) = (Clients { of: id, ..Clients::default() }, None, None);
-        Self { id, samples, sources, is_accepted, sender, clients, waiting, waiting_bytes }
+    /// A source whose samples come through this queue until it is closed.
+    pub fn new(id: Option<ZenohId>, samples: Arc<SourceQueue<Sample>>, is_accepted: Arc<AtomicBool>) -> Self {
+        Self { id, samples, is_accepted, clients: Clients { of: id, ..Clients::default() } }
     }
 
-    /// Decodes the samples and sends reports, until the channel is closed and everything is reported.
+    /// Decodes the samples and sends reports, until the queue is closed and everything is reported.
     pub async fn run(mut self, common: &Common) {
+        let gateway = &common.gateway;
         let (outcome_sender, mut outcomes): (OutcomeSender, _) = unbounded_channel();
         let mut repeat = tokio::time::interval(REPEAT.0);
+        let samples = self.samples.clone();
+        // A stream, because a source that stops waiting loses its turn.
+        let mut admitted = pin!(stream::unfold((), |()| async { Some((samples.next(&gateway.admission).await?, ())) }));
         let mut is_open = true;
-        while is_open || self.waiting.is_some() || !self.clients.are_idle() {
-            let has_credit = is_open && self.waiting.is_none() && self.has_credit(&common.gateway);
+        while is_open || !self.clients.are_idle() {
+            let has_credit = is_open && self.clients.have_credit(gateway.in_flight_max / SOURCES_MAX);
             tokio::select! {
                 // Outcomes first, because they give credit.
                 biased;
@@ -112,11 +85,8 @@ impl Source {
                         self.record_outcome(id, outcome);
                     }
                 }
-                time = Waiting::time(&mut self.waiting), if self.waiting.is_some() => {
-                    self.push_waiting(&common.gateway, time, &outcome_sender);
-                }
-                sample = self.samples.recv(), if has_credit => match sample {
-                    Some(sample) => self.decode(sample, common).await,
+                sample = admitted.next(), if has_credit => match sample {
+                    Some((key, sample, permit)) => self.push(&key, sample, permit, common, &outcome_sender).await,
                     None => is_open = false,
                 },
                 _ = repeat.tick() => {
@@ -124,14 +94,14 @@ impl Source {
                     self.clients.forget_silent(Instant::now());
                 }
             }
-            self.clients.forgotten.drain(..).for_each(|mut session| common.gateway.end(&mut session));
+            self.clients.forgotten.drain(..).for_each(|mut session| gateway.end(&mut session));
             for report in self.clients.next_reports() {
                 if let Err(error) = common.reports.put(report.encode_to_vec()).await {
                     tracing::debug!(%error, "zenoh: report");
                 }
             }
         }
-        self.clients.all.into_iter().for_each(|mut client| common.gateway.end(&mut client.session));
+        self.clients.all.into_iter().for_each(|mut client| gateway.end(&mut client.session));
     }
 
     fn record_outcome(&mut self, id: ObservationId, outcome: Outcome) {
@@ -141,17 +111,15 @@ impl Source {
         self.clients.record_outcome(id, outcome);
     }
 
-    /// True if another sample may be decoded: each source has an equal part of the events and bytes that one stream
-    /// over gRPC may have in flight.
-    fn has_credit(&self, gateway: &Gateway) -> bool {
-        let sources = self.sources.load(Ordering::Relaxed).max(1);
-        let (events_max, bytes_max) = (gateway.in_flight_max / sources, gateway.limits.message_bytes_max / sources);
-        self.clients.have_credit(events_max, bytes_max)
-    }
-
-    /// Decodes a sample; the observation waits for the engine's time, or is refused.
-    async fn decode(&mut self, sample: QueuedSample, common: &Common) {
-        let QueuedSample { key, payload, length, queued } = sample;
+    /// Decodes an admitted sample and pushes its events, or refuses it.
+    async fn push(
+        &mut self,
+        key: &str,
+        Sample { payload, length }: Sample,
+        permit: AdmissionPermit,
+        common: &Common,
+        outcomes: &OutcomeSender,
+    ) {
         let gateway = &common.gateway;
         let bytes = Bytes::from(payload.to_bytes().into_owned());
         let bytes_max = gateway.limits.message_bytes_max;
@@ -172,12 +140,12 @@ impl Source {
             let (rpc, vehicle) = ("/clearway.v1.IngestService/Stream", Some(&*gateway.vehicle));
             if let Err(denied) = senders.lock().await.check(rpc, vehicle, self.id).await {
                 if session.check_number(number).is_ok() {
-                    session.begin(number, 0, 0);
+                    session.begin(number, 0);
                 }
                 return gateway.refuse(session, number, "role", denied);
             }
         }
-        match sensor_of_key(&key, observation.body.as_ref()) {
+        match sensor_of_key(key, observation.body.as_ref()) {
             Some(sensor) => sensor.clone_into(&mut observation.sensor),
             None => {
                 let message = format!(
@@ -187,16 +155,8 @@ impl Source {
                 return gateway.refuse(session, number, "key", message);
             }
         }
-        self.waiting = Some(gateway.time.wait(observation, length, &self.sender));
-        self.waiting_bytes = Some(queued);
-    }
-
-    fn push_waiting(&mut self, gateway: &Gateway, time: EngineTime, outcomes: &OutcomeSender) {
-        let Some(Waiting { observation, bytes, .. }) = self.waiting.take() else { return };
-        self.waiting_bytes = None;
-        let session = &mut self.clients.get_or_insert(observation.client).session;
         // The gateway counts and reports an unknown sensor itself.
-        let _ = gateway.push(observation, bytes, time, session, outcomes);
+        let _ = gateway.push(observation, permit, session, outcomes);
     }
 }
 
@@ -287,15 +247,14 @@ impl Clients {
         self.all.iter().position(|client| client.session.is_idle())
     }
 
-    /// True if another observation of any client, also of a new one, may be decoded: fewer than `events_max` events and
-    /// `bytes_max` bytes of all clients are in flight, and a new client has space.
-    fn have_credit(&self, events_max: usize, bytes_max: usize) -> bool {
+    /// True if another observation of any client, also of a new one, may be decoded: fewer than `events_max` events of
+    /// all clients are in flight, and a new client has space.
+    fn have_credit(&self, events_max: usize) -> bool {
         if self.all.len() >= CLIENTS_MAX && self.longest_idle().is_none() {
             return false;
         }
-        let (events, bytes) =
-            self.all.iter().map(|client| client.session.in_flight()).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
-        events == 0 || (events < events_max && bytes < bytes_max)
+        let events: usize = self.all.iter().map(|client| client.session.events()).sum();
+        events == 0 || events < events_max
     }
 
     fn request_repetitions(&mut self) {
@@ -326,10 +285,10 @@ mod tests {
     #[test]
     fn a_new_client_replaces_the_longest_silent_idle_client_or_waits() {
         let mut clients = Clients::default();
-        let has_space = |clients: &Clients| clients.have_credit(usize::MAX, usize::MAX);
+        let has_space = |clients: &Clients| clients.have_credit(usize::MAX);
         for id in 1..=CLIENTS_MAX as u64 {
             assert!(has_space(&clients), "client {id}");
-            clients.get_or_insert(id).session.begin(1, 1, 10);
+            clients.get_or_insert(id).session.begin(1, 1);
         }
         assert!(!has_space(&clients), "each has an event in flight");
         for id in [7, 3] {
@@ -337,7 +296,7 @@ mod tests {
         }
         assert!(has_space(&clients));
         assert_eq!(clients.next_reports().len(), CLIENTS_MAX, "all reports are sent before another client comes");
-        clients.get_or_insert(1000).session.begin(1, 1, 10);
+        clients.get_or_insert(1000).session.begin(1, 1);
         let is_known = |id| clients.all.iter().any(|client| client.id == id);
         assert!(!is_known(3) && is_known(7), "3 was silent longer");
         assert_eq!(clients.next_reports().len(), 1, "the report of the new client");

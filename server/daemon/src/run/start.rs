@@ -29,7 +29,7 @@ use crate::base::held_sockets::HeldSockets;
 #[cfg(feature = "zenoh")]
 use crate::config::ZenohMode;
 use crate::config::{self, Certificates, Config, Vehicle, listeners};
-use crate::engine::turns::Turns;
+use crate::engine::compute_permits::ComputePermits;
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
@@ -248,7 +248,7 @@ impl Running {
             }
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
-        let turns = Arc::new(Turns::of_processors());
+        let permits = Arc::new(ComputePermits::of_processors());
         for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
             if driver.from_files {
@@ -264,7 +264,7 @@ impl Running {
                 continue;
             }
             let name = status.name.clone();
-            let thread = engine.start(events, turns.clone());
+            let thread = engine.start(events, permits.clone());
             let thread = thread.map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
             self.engines.push((name, thread));
         }
@@ -273,10 +273,8 @@ impl Running {
 
     /// The gateways of the vehicles that allow observations.
     fn gateways(&self, config: &Config) -> Gateways {
-        let vehicles = config.vehicles.iter().zip(&self.inputs).zip(self.vehicles.statuses());
-        let enabled = vehicles.filter(|((vehicle, _), _)| vehicle.ingest.enabled);
-        let gateways =
-            enabled.map(|((vehicle, input), status)| Gateway::new(vehicle, &input.queue, status.map_time.clone()));
+        let enabled = config.vehicles.iter().zip(&self.inputs).filter(|(vehicle, _)| vehicle.ingest.enabled);
+        let gateways = enabled.map(|(vehicle, input)| Gateway::new(vehicle, &input.queue));
         Gateways::new(gateways, self.stop.subscribe())
     }
 

@@ -6,7 +6,6 @@
 //! | [`transports`] | readers that come, go and skip maps -> counts by transport |
 //! | [`window`], [`histogram`] | maps and packet counts -> rates, loss and latency of the last 10 s; buckets of times |
 //! | [`network`] | hung listeners, absent routers, ends of certificates, times of the link -> problems in words |
-//! | [`map_time`] | how long the newest maps took -> how long a map of so many points takes |
 //! | [`health`] | what is known at one time -> ok, warn or error, with reasons |
 //! | [`assess`] | the status of a vehicle -> its state, again and again |
 //! | `message` | a snapshot and a state -> message, JSON |
@@ -21,7 +20,6 @@ pub mod assess;
 pub mod health;
 pub mod histogram;
 mod json;
-pub mod map_time;
 mod message;
 mod metrics;
 pub mod network;

@@ -23,7 +23,7 @@ pub const PACKET_REASONS: [&str; 19] = [
     "telemetry",
 ];
 /// Reasons for which messages are no observations.
-pub const OBSERVATION_REASONS: [&str; 14] = [
+pub const OBSERVATION_REASONS: [&str; 13] = [
     "body",
     "columns",
     "message",
@@ -36,7 +36,6 @@ pub const OBSERVATION_REASONS: [&str; 14] = [
     "ros_frames",
     "ros_kind",
     "ros_message",
-    "scan_time",
     "stamp_ahead",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.

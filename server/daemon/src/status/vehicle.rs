@@ -26,7 +26,6 @@ use clearway_journal::encode::EncodedMap;
 
 use super::health::{Health, State};
 use super::histogram::Histogram;
-use super::map_time::MapTime;
 use super::network::Network;
 use super::notices::Notices;
 use super::transports::{Readers, Transport};
@@ -50,8 +49,6 @@ pub struct VehicleStatus {
     pub boot_id: u64,
     /// Names of the layers of its maps, in order.
     pub layers: Vec<&'static str>,
-    /// How long its maps take.
-    pub map_time: Arc<MapTime>,
     /// Subscriptions of readers to the layers.
     pub subscriptions: LayerSubscriptions,
     /// The newest map that each acknowledging reader has finished with.
@@ -207,7 +204,6 @@ impl VehicleStatus {
         Self {
             name,
             boot_id,
-            map_time: Arc::default(),
             subscriptions: LayerSubscriptions::new(&layers),
             acknowledgements: Acknowledgements::default(),
             sweeps: watch::Sender::new(None),

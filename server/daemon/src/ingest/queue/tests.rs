@@ -3,7 +3,6 @@
 use clearway_mapping::ledger::Ledger;
 
 use super::*;
-use crate::ingest::engine_time::EngineTime;
 use crate::ingest::receipt::ObservationId;
 
 fn unreported(queue: &EventQueue) -> Ledger {
@@ -52,7 +51,7 @@ fn drops_are_reported_at_once_then_seldom_and_completely_at_the_end() {
 #[test]
 fn a_receipt_delivers_that_the_queue_was_full_or_the_engine_stopped() {
     let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
-    let receipt = |number| Receipt::new(ObservationId { client: 0, number }, EngineTime::default(), &sender);
+    let receipt = |number| Receipt::new(ObservationId { client: 0, number }, None, &sender);
     let (queue, events) = event_queue(1);
     queue.push_observation(Some(42), 0, Body::End, receipt(1)).unwrap();
     assert!(outcomes.try_recv().is_err(), "the engine has not handled the event yet");
@@ -78,7 +77,7 @@ fn a_closed_queue_ends_after_its_events_although_clones_remain() {
     queue.push(0, Body::End).unwrap();
     queue.close();
     assert_eq!(events.iter().count(), 1);
-    let receipt = Receipt::new(ObservationId { client: 0, number: 1 }, EngineTime::default(), &sender);
+    let receipt = Receipt::new(ObservationId { client: 0, number: 1 }, None, &sender);
     assert_eq!(clone.push_observation(None, 0, Body::End, receipt), Err(QueueClosedError));
     assert!(matches!(outcomes.try_recv().unwrap().1, Outcome::Refused { reason: "stopped", .. }));
 }
