@@ -11,7 +11,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     loop {
         let map = maps.next().await?.map;
         let age_ms = map.age_ms(now_ns());
-        match map.nearest_obstacle("terrain", 0.0, 0.0)? {
+        match map.nearest_obstacle("terrain", [0.0; 2], None)? {
             Some(obstacle) => {
                 let bearing_deg = obstacle.bearing_rad.to_degrees();
                 let side = if bearing_deg < 0.0 { "right" } else { "left" };

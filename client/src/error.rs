@@ -2,6 +2,8 @@
 
 use clearway_proto::map::MapError;
 
+use crate::footprint::shape::ShapeError;
+
 /// Why a call failed. `address` is that of the server or router, as the client connected to it.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum ClientError {
@@ -67,6 +69,15 @@ pub enum ClientError {
         layer: String,
         /// Names of the layers that the map has.
         present: Vec<String>,
+    },
+    /// An area, a path or a point of a question cannot be judged.
+    #[error(transparent)]
+    Shape(#[from] ShapeError),
+    /// The question needs square cells.
+    #[error("layer {layer:?} has a radial grid; the clearance is computed on square cells alone")]
+    NoSquares {
+        /// Name of the layer.
+        layer: String,
     },
     /// The text is no key that signs maps, or no public key that checks them.
     #[error("key of signed maps: {reason}")]

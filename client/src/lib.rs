@@ -22,7 +22,7 @@
 //! |---|---|
 //! | `freshness` | two clocks -> least age of a map |
 //! | [`view`] | encoded map -> [`MapView`]: decoded once, cheap to clone, with its age |
-//! | [`footprint`] | map and rectangle or point -> whether it is free, the nearest obstacle |
+//! | [`footprint`] | map and area, path or point -> whether it is free, what blocks it, what is nearest, the clearance |
 //! | [`stream`] | updates -> the newest map, with the number of skipped ones |
 //! | [`grpc`] | address of a server -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
@@ -51,7 +51,9 @@ pub use clearway_proto::map::{Channel, Layer, SafePoint};
 pub use clearway_proto::{codec, grid, v1};
 
 pub use error::ClientError;
-pub use footprint::{Footprint, Obstacle};
+pub use footprint::clearance::Clearance;
+pub use footprint::shape::{Area, Footprint, Outline, Path, ShapeError};
+pub use footprint::{Along, Answer, Blocker, Obstacle};
 pub use freshness::now_ns;
 pub use grpc::{Client, Subscription, Tls};
 pub use ingest::Ingester;

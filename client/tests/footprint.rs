@@ -117,7 +117,7 @@ proptest! {
         let grid = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.0, length_m: 7.0, width_m: 7.0 };
         let seen = points(&grid, 0.0).filter(|&(x, y)| layer.class_at(x, y).0 == 3);
         let seen = seen.map(|(ox, oy): (f64, f64)| (ox - x).hypot(oy - y)).min_by(f64::total_cmp);
-        let Some(obstacle) = map.nearest_obstacle("drivability", x, y).unwrap() else {
+        let Some(obstacle) = map.nearest_obstacle("drivability", [x, y], None).unwrap() else {
             prop_assert_eq!(seen, None);
             return Ok(());
         };
@@ -142,31 +142,33 @@ fn unknown_cells_and_points_outside_the_grid_are_never_free() {
     assert!(known.is_free("drivability", &footprint).unwrap());
     let unknown = view(cartesian(0.0), &[0; (SIDE * SIDE) as usize]);
     assert!(!unknown.is_free("drivability", &footprint).unwrap());
-    assert_eq!(unknown.nearest_obstacle("drivability", 0.0, 0.0).unwrap(), None);
-    for x_m in [1.3, 100.0, f64::NAN, f64::INFINITY] {
+    assert_eq!(unknown.nearest_obstacle("drivability", [0.0, 0.0], None).unwrap(), None);
+    for x_m in [1.3, 100.0] {
         assert!(!known.is_free("drivability", &Footprint { x_m, ..footprint }).unwrap(), "{x_m}");
     }
-    assert!(known.is_free("speed", &footprint).is_err() && known.nearest_obstacle("speed", 0.0, 0.0).is_err());
+    assert!(known.is_free("speed", &footprint).is_err() && known.nearest_obstacle("speed", [0.0, 0.0], None).is_err());
 }
 
 #[test]
 fn only_the_meaning_free_is_free_and_only_occupied_is_an_obstacle() {
-    use ClassMeaning::{Free, Hidden, Inferred, NotReached, Occupied, Unknown};
+    use ClassMeaning::{Free, Hidden, Inferred, Low, NotReached, Occupied, Unknown};
     let footprint = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.3, length_m: 1.0, width_m: 0.5 };
-    for meaning in [Unknown, Free, Inferred, Occupied, Hidden, NotReached] {
+    for meaning in [Unknown, Free, Inferred, Occupied, Hidden, NotReached, Low] {
         // The name of the class has no influence.
         let classes = [("unknown", Unknown, 0), ("drivable", meaning, 0)];
         let map = view_of(cartesian(0.0), &[1; (SIDE * SIDE) as usize], &classes);
         assert_eq!(map.is_free("drivability", &footprint).unwrap(), meaning == Free, "{meaning:?}");
-        let obstacle = map.nearest_obstacle("drivability", 0.0, 0.0).unwrap();
+        let obstacle = map.nearest_obstacle("drivability", [0.0, 0.0], None).unwrap();
         assert_eq!(obstacle.is_some(), meaning == Occupied, "{meaning:?}");
+        let low = map.nearest_low("drivability", [0.0, 0.0], None).unwrap();
+        assert_eq!(low.is_some(), meaning == Low, "{meaning:?}");
     }
 }
 
 #[test]
 fn an_obstacle_in_an_innermost_cell_is_0_m_away() {
     let map = view(radial(8, [0.0; 2]), &[[0, 0, 0, 0, 0, 0, 0, 3], [0; 8], [0; 8]].concat());
-    let obstacle = map.nearest_obstacle("drivability", 0.0, 0.0).unwrap().unwrap();
+    let obstacle = map.nearest_obstacle("drivability", [0.0, 0.0], None).unwrap().unwrap();
     assert_eq!(obstacle.distance_m, 0.0, "{obstacle:?}");
 }
 
@@ -174,10 +176,10 @@ fn an_obstacle_in_an_innermost_cell_is_0_m_away() {
 fn distance_and_bearing_are_those_of_the_cells_border() {
     let map = MapView::decode(common::map(5, common::CAPTURE_END_NS)).unwrap();
     // The obstacle is from 10 to 20 m, ahead and to the right: its nearest point is on the inner border of its row.
-    let obstacle = map.nearest_obstacle("drivability", 0.0, -4.0).unwrap().unwrap();
+    let obstacle = map.nearest_obstacle("drivability", [0.0, -4.0], None).unwrap().unwrap();
     assert!(
         (obstacle.distance_m - 6.0).abs() < 1e-9 && (obstacle.bearing_rad + FRAC_PI_2).abs() < 1e-9,
         "{obstacle:?}"
     );
-    assert_eq!(map.nearest_obstacle("drivability", 10.0, -10.0).unwrap().unwrap().distance_m, 0.0);
+    assert_eq!(map.nearest_obstacle("drivability", [10.0, -10.0], None).unwrap().unwrap().distance_m, 0.0);
 }

@@ -73,7 +73,7 @@ impl Planner {
             self.seen.insert(cell, Seen { mps, stamp_ns });
         }
         // Uses the cells of the obstacles, so that none lies between two cells of the planner.
-        let occupied = |index: &usize| layer.meaning_of(*index) == ClassMeaning::Occupied;
+        let occupied = |index: &usize| matches!(layer.meaning_of(*index), ClassMeaning::Occupied | ClassMeaning::Low);
         for index in (0..layer.grid.cell_count() as usize).filter(occupied) {
             let Some((x, y)) = layer.grid.centre_of(index).filter(|(x, y)| x.hypot(*y) < RANGE_M) else { continue };
             self.seen.insert(cell_of(self.in_map([x, y])), Seen { mps: 0.0, stamp_ns });

@@ -59,6 +59,7 @@ class Meaning(IntEnum):
     OCCUPIED = map_pb2.CLASS_MEANING_OCCUPIED
     HIDDEN = map_pb2.CLASS_MEANING_HIDDEN
     NOT_REACHED = map_pb2.CLASS_MEANING_NOT_REACHED
+    LOW = map_pb2.CLASS_MEANING_LOW
 
 
 class LegendEntry(NamedTuple):

@@ -34,7 +34,7 @@ export const css = ([red, green, blue]) => `rgb(${red} ${green} ${blue})`;
 // readers to whom the classes' own colours look alike.
 const BY_MEANING = {
   free: [0, 114, 178], inferred: [86, 180, 233], occupied: [213, 94, 0], hidden: [204, 121, 167],
-  "not reached": [150, 150, 150], unknown: UNKNOWN,
+  "not reached": [150, 150, 150], low: [240, 228, 66], unknown: UNKNOWN,
 };
 
 // A legend with colours by meaning. Classes of one meaning differ in lightness.

@@ -4,7 +4,7 @@
 import { DecodeError } from "./limits.js";
 
 // By number on the wire. A meaning that is not listed counts as unknown.
-const MEANINGS = ["unknown", "free", "inferred", "occupied", "hidden", "not reached"];
+const MEANINGS = ["unknown", "free", "inferred", "occupied", "hidden", "not reached", "low"];
 const UNKNOWN = 0;
 
 export function readLegend({ name: layer, legend: names, legend_meanings: meanings, legend_rgb: colours }) {

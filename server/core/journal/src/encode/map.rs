@@ -305,6 +305,7 @@ pub fn meaning(meaning: Meaning) -> v1::ClassMeaning {
         Meaning::Occupied => v1::ClassMeaning::Occupied,
         Meaning::Hidden => v1::ClassMeaning::Hidden,
         Meaning::NotReached => v1::ClassMeaning::NotReached,
+        Meaning::Low => v1::ClassMeaning::Low,
     }
 }
 

@@ -19,6 +19,8 @@ pub enum Meaning {
     Hidden,
     /// The cell itself is free ground, but the layer found no way there for the vehicle.
     NotReached,
+    /// Something stands in the cell that is higher than the vehicle's ground clearance, and lower than an obstacle.
+    Low,
 }
 
 /// One entry of a legend: a class of a layer.
@@ -94,7 +96,7 @@ pub(crate) fn drivable_share(legend: &[ClassInfo], class: &[u8]) -> f64 {
         let cells = || count_cells(class, value);
         match info.meaning {
             Meaning::Free => (free, judged) = (free + cells(), judged + cells()),
-            Meaning::NotReached | Meaning::Occupied => judged += cells(),
+            Meaning::NotReached | Meaning::Occupied | Meaning::Low => judged += cells(),
             Meaning::Unknown | Meaning::Inferred | Meaning::Hidden => {}
         }
     }

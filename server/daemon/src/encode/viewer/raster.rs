@@ -9,7 +9,7 @@
 //! | occupancy | meaning of the class |
 //! |---|---|
 //! | 0 | free |
-//! | 100 | occupied, not reached |
+//! | 100 | occupied, low, not reached |
 //! | -1 | unknown, inferred, hidden |
 //!
 //! There is no value between, because planners with a threshold would treat less than 100 as free.
@@ -172,7 +172,7 @@ fn occupancies(layer: &Layer) -> Vec<i8> {
 pub fn occupancy(meaning: ClassMeaning) -> i8 {
     match meaning {
         ClassMeaning::Free => FREE,
-        ClassMeaning::Occupied | ClassMeaning::NotReached => OCCUPIED,
+        ClassMeaning::Occupied | ClassMeaning::Low | ClassMeaning::NotReached => OCCUPIED,
         ClassMeaning::Unknown | ClassMeaning::Inferred | ClassMeaning::Hidden => UNKNOWN,
     }
 }
