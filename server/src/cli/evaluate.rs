@@ -8,18 +8,22 @@ use anyhow::Result;
 use clap::Args;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
+use clearway_tools::evaluate::footprint::gate::FootprintGate;
 use clearway_tools::evaluate::source::variation::Variation;
 use clearway_tools::evaluate::{EvaluateOptions, evaluate};
 use indicatif::ProgressBar;
 
 use super::shared::configuration::extrinsics;
+use super::shared::exit::Exit;
 use super::shared::output::{print, print_line, usage_error};
 
 /// Judge every map against labelled scans, simulated scenes or random worlds.
 ///
 /// Prints, for each map, precision and reach (recall of all reachable ground) of the drivable cells, recall by range
 /// and by class of ground, false obstacles (ground called occupied), F1 of ground points, and the leaks: cells called
-/// drivable with a car, person, pole or fence in them, or behind a fence.
+/// drivable with a car, person, pole or fence in them, or behind a fence. Then for each map the share of the vehicle
+/// footprints (4 m by 2 m) free by the truth that it answers free, and the footprints answered free in which something
+/// stands.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway evaluate sequences/00
@@ -28,6 +32,7 @@ use super::shared::output::{print, print_line, usage_error};
   clearway evaluate scans --labels truth --extrinsics 0,0,1.9,0,0,0 --model hdl32e --config car.toml
   clearway evaluate sim:town --json
   clearway evaluate sim:random --seeds 0..100 --model vlp16
+  clearway evaluate sequences/00 --fail-under freespace=96 --fail-under freespace=95@20-30
 
 Even seeds, and the variations without an asterisk, are for tuning. Odd seeds, and the variations with an asterisk, are
 for final tables only: no parameter may be chosen by their figures.")]
@@ -67,6 +72,11 @@ pub struct EvaluateArguments {
     /// Override a key of the configuration, such as vehicle.maps.terrain.variant=paper; may be given several times.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Exit with code 1 if the layer answers free less than this percentage of the vehicle footprints that the truth
+    /// calls free, at 4 to 20 m or in the range given, or any in which something of 0.5 m stands, or of 0.3 m within
+    /// 20 m; may be given several times.
+    #[arg(long, value_name = "LAYER=PERCENT[@FROM-TO]")]
+    fail_under: Vec<FootprintGate>,
 }
 
 /// Reads a range of seeds.
@@ -99,7 +109,7 @@ fn variations(names: &[String]) -> Result<Vec<Variation>, String> {
 ///
 /// # Errors
 /// As [`evaluate`].
-pub fn run(arguments: EvaluateArguments) -> Result<()> {
+pub fn run(arguments: EvaluateArguments) -> Result<Exit> {
     let EvaluateArguments {
         paths,
         labels,
@@ -111,6 +121,7 @@ pub fn run(arguments: EvaluateArguments) -> Result<()> {
         seeds,
         config,
         set,
+        fail_under,
     } = arguments;
     let variations = variations(&names).map_err(usage_error)?;
     let options = EvaluateOptions { paths, labels, extrinsics, model, variations, write_scans, seeds, config, set };
@@ -127,5 +138,7 @@ pub fn run(arguments: EvaluateArguments) -> Result<()> {
     } else {
         print(&evaluation.to_text())?
     };
-    Ok(())
+    let failures = evaluation.failures(&fail_under);
+    failures.iter().for_each(|failure| eprintln!("clearway: {failure}"));
+    Ok(if failures.is_empty() { Exit::Good } else { Exit::Differs })
 }

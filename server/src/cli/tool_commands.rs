@@ -26,7 +26,7 @@ pub enum ToolCommand {
 pub fn run(command: ToolCommand) -> Result<Exit> {
     match command {
         ToolCommand::Demo(arguments) => demo::run(arguments)?,
-        ToolCommand::Evaluate(arguments) => evaluate::run(arguments)?,
+        ToolCommand::Evaluate(arguments) => return evaluate::run(arguments),
         ToolCommand::Init(arguments) => init::run(arguments)?,
         ToolCommand::Get(options) => return get::run(&options),
         ToolCommand::Export(arguments) => return export::run(arguments),

@@ -63,6 +63,8 @@ pub struct JudgedPoint {
     pub place: [f32; 3],
     /// Name of its class, under which its leaks are counted: `car`, `unreachable`, ...
     pub class: &'static str,
+    /// Height over the true ground, in metres.
+    pub over_m: f32,
     /// Its vote for the truth of its cell.
     pub vote: Vote,
     /// True if it is on a road or a lane marking.
@@ -324,7 +326,7 @@ mod tests {
             Vote::Obstacle => Scored::Other,
             _ => Scored::Not,
         };
-        JudgedPoint { place: [x, 0.5, z], class, vote, road: class == "road", ground: [ground, Scored::Not] }
+        JudgedPoint { place: [x, 0.5, z], over_m: z, class, vote, road: class == "road", ground: [ground, Scored::Not] }
     }
 
     #[test]

@@ -8,6 +8,7 @@
 //! | [`options`] | what is judged -> a configuration of the maps |
 //! | [`source`] | paths, scenes, seeds -> maps, and the truth about their points |
 //! | [`judge`] | a layer and points of known truth -> counts |
+//! | [`footprint`] | a map and points of known truth -> counts of whole footprints of a vehicle |
 //! | [`tally`] | counts -> sums and shares |
 //! | [`report`] | counts -> JSON |
 //! | [`table`] | counts -> tables |
@@ -18,6 +19,7 @@ use anyhow::{Result, bail};
 
 use crate::scenes::{self, NamedScene, SCENES};
 
+pub mod footprint;
 pub mod judge;
 pub mod options;
 pub mod report;

@@ -1,8 +1,15 @@
 //! The result of an evaluation, and the result as JSON. `table.rs` writes it as text.
 
+use anyhow::Result;
+use clearway_client::MapView;
+use clearway_journal::encode::EncodedMap;
 use clearway_mapping::pipeline::Pipeline;
 use serde_json::{Value, json};
 
+use super::footprint::gate::FootprintGate;
+use super::footprint::ground::KnownPlace;
+use super::footprint::tally::{self as footprint_tally, Bands, FootprintTally, HELD_M};
+use super::footprint::{judge_footprints, judged_footprints};
 use super::judge::{JudgedPoint, judge, judge_ground};
 use super::tally::{BANDS, BANDS_M, CellCount, Confusion, Tally};
 
@@ -36,15 +43,32 @@ pub struct EvaluatedRow {
     pub frames: u64,
     /// Name and counts of each layer, in the order of the map.
     pub layers: Vec<(String, Tally)>,
+    /// Name and counts of whole footprints of each layer, in the order of the map.
+    pub footprints: Vec<(String, FootprintTally)>,
     /// Names of the layers without a free class.
     pub left_out: Vec<String>,
     /// Time that the maps of each frame took, in milliseconds.
     pub step_ms: Vec<f64>,
 }
 
+/// The truth of one frame.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameTruth<'a> {
+    /// The points of the sweep.
+    pub points: &'a [JudgedPoint],
+    /// The points from which the truth of footprints is made: the same, or those of a scan with more lasers.
+    pub whole: &'a [JudgedPoint],
+    /// Places whose truth is known without a return.
+    pub known: &'a [KnownPlace],
+}
+
 impl EvaluatedRow {
-    /// Adds the counts of a pipeline's newest map, and of its estimate of the ground, against the points of its frame.
-    pub fn judge_map(&mut self, pipeline: &Pipeline, points: &[JudgedPoint]) {
+    /// Adds the counts of a pipeline's newest map, and of its estimate of the ground, against the truth of its frame.
+    ///
+    /// # Errors
+    /// If the map cannot be read as a planner reads it.
+    pub fn judge_map(&mut self, pipeline: &Pipeline, truth: FrameTruth<'_>) -> Result<()> {
+        let FrameTruth { points, whole, known } = truth;
         self.frames += u64::from(pipeline.newest_map().is_some());
         for layer in pipeline.newest_map().iter().flat_map(|map| &map.layers) {
             let mut tally = Tally::default();
@@ -58,6 +82,13 @@ impl EvaluatedRow {
             let height_over_m = |[x, y, z]: [f32; 3]| Some(ground.height_over_m(x, y, z)).filter(|over| !over.is_nan());
             judge_ground(self.tally("ground"), points, height_over_m);
         }
+        let Some(map) = pipeline.newest_map() else { return Ok(()) };
+        let view = MapView::decode(EncodedMap::new(map, "judged".into(), 0, 0).select(&[]))?;
+        let footprints = judged_footprints(whole, known, pipeline.newest_sweep().mount_m);
+        for layer in map.layers.iter().filter(|layer| !self.left_out.iter().any(|name| name == layer.name)) {
+            judge_footprints(of(&mut self.footprints, layer.name), &view, layer.name, &footprints)?;
+        }
+        Ok(())
     }
 
     /// Adds the counts of another row.
@@ -65,6 +96,9 @@ impl EvaluatedRow {
         self.frames += other.frames;
         for (name, tally) in &other.layers {
             self.tally(name).merge(tally);
+        }
+        for (name, tally) in &other.footprints {
+            of(&mut self.footprints, name).merge(tally);
         }
         for name in &other.left_out {
             if !self.left_out.contains(name) {
@@ -80,11 +114,7 @@ impl EvaluatedRow {
     }
 
     fn tally(&mut self, name: &str) -> &mut Tally {
-        let at = self.layers.iter().position(|(layer, _)| layer == name).unwrap_or_else(|| {
-            self.layers.push((name.to_owned(), Tally::default()));
-            self.layers.len() - 1
-        });
-        &mut self.layers[at].1
+        of(&mut self.layers, name)
     }
 
     /// Median time that the maps of a frame took, in milliseconds; `None` if it was not measured.
@@ -93,6 +123,15 @@ impl EvaluatedRow {
         times.sort_by(f64::total_cmp);
         times.get(times.len() / 2).copied()
     }
+}
+
+/// The counts of a layer, which are made if there are none.
+fn of<'a, T: Default>(layers: &'a mut Vec<(String, T)>, name: &str) -> &'a mut T {
+    let at = layers.iter().position(|(layer, _)| layer == name).unwrap_or_else(|| {
+        layers.push((name.to_owned(), T::default()));
+        layers.len() - 1
+    });
+    &mut layers[at].1
 }
 
 /// One random world.
@@ -143,6 +182,24 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
+    /// Why the footprints do not pass the gates, a line for each path, row and gate. Of random worlds, all worlds
+    /// together count.
+    pub fn failures(&self, gates: &[FootprintGate]) -> Vec<String> {
+        let mut failures = Vec::new();
+        for source in &self.sources {
+            let rows = if source.worlds.is_empty() { source.rows.len() } else { 1 };
+            for (row, gate) in source.rows.iter().take(rows).flat_map(|row| gates.iter().map(move |gate| (row, gate))) {
+                let tally = row.footprints.iter().find(|(layer, _)| *layer == gate.layer);
+                let failure = match tally {
+                    None => Some("the maps have no such layer that answers".to_owned()),
+                    Some((_, tally)) => gate.failure(tally),
+                };
+                failures.extend(failure.map(|why| format!("{} {}: {gate}: {why}", source.path, row.name)));
+            }
+        }
+        failures
+    }
+
     /// The report as a JSON object; a share of zero cells or points is null. `maps` of a source are those of its first
     /// row.
     pub fn to_json(&self) -> Value {
@@ -162,6 +219,8 @@ impl Evaluation {
         json!({
             "protocols": PROTOCOLS.map(|(name, words)| json!({ "name": name, "counts": words })),
             "range_bands_m": BANDS_M,
+            "footprint_range_bands_m": footprint_tally::BANDS_M,
+            "footprint_things_m": HELD_M,
             "sources": self.sources.iter().map(source).collect::<Vec<_>>(),
         })
     }
@@ -174,6 +233,7 @@ fn row(row: &EvaluatedRow) -> Value {
         "frames": row.frames,
         "step_ms_p50": row.step_ms_p50(),
         "maps": maps(row),
+        "footprints": footprints(row),
         "left_out": row.left_out,
     })
 }
@@ -184,11 +244,38 @@ fn world(world: &EvaluatedWorld) -> Value {
         "name": world.name,
         "description": world.description,
         "maps": maps(&world.row),
+        "footprints": footprints(&world.row),
     })
 }
 
 fn maps(row: &EvaluatedRow) -> Vec<Value> {
     row.layers.iter().map(|(name, tally)| layer(name, tally)).collect()
+}
+
+fn footprints(row: &EvaluatedRow) -> Vec<Value> {
+    let bands = |counts: &Bands| {
+        let band = |count: &CellCount| json!({ "footprints": count.all, "answered_free": count.of_them });
+        counts.iter().map(band).collect::<Vec<_>>()
+    };
+    let wrong = |wrong: &footprint_tally::WrongFootprint| {
+        json!({
+            "x_m": wrong.x_m, "y_m": wrong.y_m, "heading_deg": wrong.heading_deg,
+            "class": wrong.class, "height_m": wrong.height_m,
+        })
+    };
+    let of_layer = |(name, tally): &(String, FootprintTally)| {
+        json!({
+            "layer": name,
+            "one_level": bands(&tally.level),
+            "stepped": bands(&tally.stepped),
+            "holding": tally.holding.iter().map(bands).collect::<Vec<_>>(),
+            "unreachable": bands(&tally.unreachable),
+            "grave": tally.grave(),
+            "refused_by_class": tally.refused,
+            "wrong": tally.wrong.iter().map(wrong).collect::<Vec<_>>(),
+        })
+    };
+    row.footprints.iter().map(of_layer).collect()
 }
 
 fn layer(name: &str, tally: &Tally) -> Value {

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use super::footprint::tally as footprint_tally;
 use super::report::{EvaluatedRow, EvaluatedSource, Evaluation, PROTOCOLS};
 use super::tally::{BANDS, BANDS_M, CellCount, Tally};
 
@@ -22,6 +23,7 @@ impl Evaluation {
             let _ = writeln!(text, "{}: {} frame(s){unlabelled}", source.path, first.frames);
             source.mounts.iter().for_each(|mount| _ = writeln!(text, "  extrinsics {mount}"));
             write_layers(&mut text, source, first);
+            write_footprints(&mut text, source);
             write_worst(&mut text, source);
         }
         let _ = writeln!(
@@ -32,7 +34,11 @@ impl Evaluation {
              that is called occupied; pure ground has no other points. Not reached: drivable cells whose class means \
              free ground without a way to it. Reach is the recall of all reachable ground; bands of range in metres \
              from the vehicle. The layer ground is the shared estimate of the ground: a point within 0.2 m of it is \
-             called ground. F1 gr. and F1 veg: F1 of ground points by the two protocols below."
+             called ground. F1 gr. and F1 veg: F1 of ground points by the two protocols below. A footprint is 4 m by \
+             2 m. Of the footprints on one level that the truth calls free, the table has the share that the layer \
+             answers free, by range in metres; stepped are footprints across a kerb, at 4 to 20 m. Then of the \
+             footprints in which something stands those answered free, by the height of the highest thing; grave are \
+             those of 0.5 m, or of 0.3 m within 20 m. Refused by: the classes of the cells that forbid free footprints."
         );
         PROTOCOLS.iter().for_each(|(name, words)| _ = writeln!(text, "{name}: {words}."));
         text
@@ -87,6 +93,41 @@ fn write_layers(text: &mut String, source: &EvaluatedSource, first: &EvaluatedRo
         source.rows.iter().filter_map(EvaluatedRow::step_ms_p50).map(|ms| format!("{ms:.1}")).collect();
     if !times.is_empty() {
         let _ = writeln!(text, "  all maps, milliseconds a frame (p50), by row: {}", times.join(", "));
+    }
+}
+
+/// A line for each layer and row: how whole footprints are answered.
+fn write_footprints(text: &mut String, source: &EvaluatedSource) {
+    let width = source.rows.iter().map(|row| row.name.chars().count()).max().unwrap_or(0).max(12) + 20;
+    let names: Vec<String> =
+        footprint_tally::BANDS_M.windows(2).map(|pair| format!("{}-{}", pair[0], pair[1])).collect();
+    let names: String = names.iter().map(|name| format!("{name:>7}")).collect();
+    let _ = writeln!(
+        text,
+        "  {:<width$}{names}   4-20     n  stepped | free with a thing of 0.2, 0.3, 0.5 m; grave | unreachable | refused by",
+        "footprints answered free, %"
+    );
+    for (row, (layer, tally)) in source.rows.iter().flat_map(|row| row.footprints.iter().map(move |of| (row, of))) {
+        let bands: String = tally.level.iter().map(|count| format!("{:>7}", percent(count.share()))).collect();
+        let near = tally.level_within(4.0, 20.0);
+        let all = |bands: &footprint_tally::Bands| {
+            let sum = footprint_tally::within(bands, 4.0, 30.0);
+            format!("{}/{}", sum.of_them, sum.all)
+        };
+        let stepped = footprint_tally::within(&tally.stepped, 4.0, 20.0);
+        let refused: Vec<String> = tally.refused.iter().map(|(class, number)| format!("{class} {number}")).collect();
+        let holding = tally.holding.each_ref().map(all).join(", ");
+        let _ = writeln!(
+            text,
+            "  {:<width$}{bands} {:>6} {:>5} {:>8} | {holding}; {} | {} | {}",
+            format!("{layer} {}", row.name),
+            percent(near.share()),
+            near.all,
+            percent(stepped.share()),
+            tally.grave(),
+            all(&tally.unreachable),
+            refused.join(", ")
+        );
     }
 }
 

@@ -33,7 +33,8 @@ impl CellCount {
         share(self.of_them, self.all)
     }
 
-    fn merge(&mut self, other: &Self) {
+    /// Adds the counts of other cells.
+    pub fn merge(&mut self, other: &Self) {
         self.all += other.all;
         self.of_them += other.of_them;
     }

@@ -68,6 +68,15 @@ fn a_hand_made_street_gets_the_metrics_counted_by_hand() {
         assert_eq!((protocol.right + protocol.missed, protocol.wrong), (ground, 0));
         assert!(protocol.missed <= 60 * 5, "{protocol:?}");
     }
+    let (name, footprints) = &source.rows[0].footprints[0];
+    let near = footprints.level_within(4.0, 20.0);
+    assert!(name == "drivability" && near.all > 500 && near.share() > Some(0.9), "{near:?}");
+    let held: u64 = footprints.holding[2].iter().map(|count| count.all).sum();
+    assert!(held > 20 && footprints.grave() == 0 && footprints.wrong.is_empty(), "{footprints:?}");
+    let failures = |gate: &str| report.failures(&[gate.parse().unwrap()]);
+    assert!(failures("drivability=90").is_empty(), "{:?}", failures("drivability=90"));
+    assert!(failures("terrain=100@4-30")[0].contains("terrain=100@4-30: "), "{:?}", failures("terrain=100@4-30"));
+    assert!(failures("none=0")[0].contains("no such layer"), "{:?}", failures("none=0"));
     let text = report.to_text();
     let parts = ["drivability, %", "height_difference, %", "100.00", "0 of ", "reach of road"];
     for part in parts {
@@ -77,6 +86,11 @@ fn a_hand_made_street_gets_the_metrics_counted_by_hand() {
     let map = &json["sources"][0]["maps"][0];
     assert_eq!((map["layer"].as_str(), map["cells"]["precision"].as_f64()), (Some("drivability"), Some(1.0)));
     assert_eq!(map["ground_points"]["low_vegetation_ground"]["wrong"], 0);
+    let counts = &json["sources"][0]["rows"][0]["footprints"][0];
+    assert_eq!(
+        (counts["one_level"][0]["footprints"].as_u64(), &counts["wrong"]),
+        (Some(footprints.level[0].all), &serde_json::json!([]))
+    );
     assert_eq!(map["false_obstacles"]["pure_ground"]["called_occupied"], 0);
     // Road in every cell from 3 m on; the last band ends beyond the road.
     let road = &map["reach"]["by_class"]["road"];

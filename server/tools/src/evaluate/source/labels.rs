@@ -115,7 +115,8 @@ pub fn truth(sweep: &Sweep, classes: &[u32]) -> Vec<JudgedPoint> {
             };
             let ground = scored(*class, place[2] < LOW_VEGETATION * sweep.mount_height_m);
             let road = matches!(class, 40 | 60);
-            JudgedPoint { place: *place, class: name(*class).unwrap_or("unlabeled"), vote, road, ground }
+            let class = name(*class).unwrap_or("unlabeled");
+            JudgedPoint { place: *place, over_m: over, class, vote, road, ground }
         })
         .collect();
     mark_reachable(sweep, &mut points);

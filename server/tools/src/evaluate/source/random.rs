@@ -61,18 +61,19 @@ fn judge_random_world(world: &RandomWorld, options: &EvaluateOptions, maps: &Map
         seed: world.seed,
         ..ScannerConfig::default()
     };
-    let (mut row, mut written) = (EvaluatedRow::default(), Ok(()));
-    drive(world.scene.clone(), scanner, maps, 1, |pipeline, extrinsics, points| {
-        row.judge_map(pipeline, &points);
+    let mut row = EvaluatedRow::default();
+    drive(world.scene.clone(), scanner, maps, 1, |pipeline, extrinsics, truth| {
+        row.judge_map(pipeline, truth)?;
         if let Some(folder) = &options.write_scans {
             let rows = rows_of(world);
             let rows: Vec<&str> = rows.iter().map(|(name, _)| name.as_str()).collect();
             let (folder, name) = (&folder.join("random"), &world.seed.to_string());
             let frame = WrittenFrame { folder, name, path: PATH, rows: &rows };
-            written = write_sweep(&frame, (pipeline.newest_sweep(), extrinsics), &points);
+            write_sweep(&frame, (pipeline.newest_sweep(), extrinsics), truth.points)?;
         }
+        Ok(())
     })?;
-    written.map(|()| row)
+    Ok(row)
 }
 
 /// The path that stands for random worlds.

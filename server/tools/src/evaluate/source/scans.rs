@@ -17,7 +17,7 @@ use clearway_mapping::sensor::sweep::{Mount, Sweep};
 
 use super::super::judge::{JudgedPoint, Scored, Vote};
 use super::super::options::EvaluateOptions;
-use super::super::report::EvaluatedSource;
+use super::super::report::{EvaluatedSource, FrameTruth};
 use super::labels;
 use super::pairs::LabelledScan;
 use super::pipeline;
@@ -61,7 +61,7 @@ pub fn judge_folder(
     for (index, pair) in (0..).zip(pairs) {
         let scan = read_scan(&pair.scan, index)?;
         let classes = labels::read(&pair.labels, &pair.scan, scan.x.len())?;
-        let points = truth.points(&scan, &classes, index, &pair.scan)?;
+        let truths = truth.points(&scan, &classes, index, &pair.scan)?;
         for (variation, made) in options.variations.iter().zip(&mut pipelines) {
             let row_name = variation.to_string();
             let varied = variation.apply(&scan, extrinsics).with_context(|| pair.scan.display().to_string())?;
@@ -69,7 +69,7 @@ pub fn judge_folder(
                 let name = pair.scan.file_stem().unwrap_or_default().to_string_lossy();
                 let truth = varied.original.iter().map(|index| {
                     let index = *index as usize;
-                    (classes[index], points[index].map_or([Scored::Not; 2], |point| point.ground))
+                    (classes[index], truths[index].map_or([Scored::Not; 2], |point| point.ground))
                 });
                 let folder = folder.join(&row_name);
                 let frame = WrittenFrame { folder: &folder, name: &name, path: &source.path, rows: &[&row_name] };
@@ -95,11 +95,17 @@ pub fn judge_folder(
                 .zip(0..)
                 .map(|(original, i)| {
                     let place = [sweep.x[i], sweep.y[i], sweep.z[i]];
-                    JudgedPoint { place, ..points[*original].unwrap_or(UNKNOWN) }
+                    JudgedPoint { place, ..truths[*original].unwrap_or(UNKNOWN) }
                 })
                 .collect();
             let row = source.row(&row_name, variation.is_final_only());
-            row.judge_map(pipeline, &points);
+            // Fewer lasers are judged by the truth of all of them, which lie in the same frame.
+            let all: Vec<JudgedPoint> = match variation {
+                Variation::Lasers(_) => truths.iter().flatten().copied().collect(),
+                _ => Vec::new(),
+            };
+            let whole = if all.is_empty() { &points } else { &all };
+            row.judge_map(pipeline, FrameTruth { points: &points, whole, known: &[] })?;
             row.step_ms.push(step_ms);
             judged();
         }
@@ -108,8 +114,14 @@ pub fn judge_folder(
 }
 
 /// The truth about a point that the recorded scan's truth does not cover.
-const UNKNOWN: JudgedPoint =
-    JudgedPoint { place: [0.0; 3], class: "unlabeled", vote: Vote::Nothing, road: false, ground: [Scored::Not; 2] };
+const UNKNOWN: JudgedPoint = JudgedPoint {
+    place: [0.0; 3],
+    over_m: f32::NAN,
+    class: "unlabeled",
+    vote: Vote::Nothing,
+    road: false,
+    ground: [Scored::Not; 2],
+};
 
 /// Makes the truth of scans as they were recorded, with a pipeline that makes no map.
 struct TruthMaker {

@@ -15,8 +15,9 @@ use clearway_sim::scenes::Scene;
 use clearway_sim::truth::{Limits, Truth, TruthGrid};
 use clearway_sim::vehicle::SimulatedVehicle;
 
+use super::super::footprint::ground::KnownPlace;
 use super::super::judge::{JudgedPoint, OBSTACLE_M_MAX, OBSTACLE_M_MIN, Scored, Vote};
-use super::super::report::{EvaluatedSource, UNREACHABLE};
+use super::super::report::{EvaluatedSource, FrameTruth, UNREACHABLE};
 use super::pipeline;
 use crate::scenes::NamedScene;
 
@@ -41,23 +42,24 @@ pub fn judge_scene(
 ) -> Result<()> {
     let default = ScannerConfig::default();
     let scanner = ScannerConfig { model: model.unwrap_or(default.model), ..default };
-    drive((named.make)(), scanner, maps, named.revolutions, |pipeline, _, points| {
-        source.row("", false).judge_map(pipeline, &points);
+    drive((named.make)(), scanner, maps, named.revolutions, |pipeline, _, truth| {
+        source.row("", false).judge_map(pipeline, truth)?;
         judged();
+        Ok(())
     })
 }
 
 /// Drives through the scene until `revolutions` whole revolutions have become maps, and calls `judge` after each with
-/// the pipeline, the extrinsics of the upright sensor and the points of the map.
+/// the pipeline, the extrinsics of the upright sensor and the truth of the map.
 ///
 /// # Errors
-/// If a value of the configuration is not allowed.
+/// If a value of the configuration is not allowed, or `judge` fails.
 pub fn drive(
     scene: Scene,
     scanner: ScannerConfig,
     maps: &MapsConfig,
     revolutions: u64,
-    mut judge: impl FnMut(&Pipeline, &Extrinsics, Vec<JudgedPoint>),
+    mut judge: impl FnMut(&Pipeline, &Extrinsics, FrameTruth<'_>) -> Result<()>,
 ) -> Result<()> {
     let at = scanner.ego_from_sensor.translation;
     let extrinsics = Extrinsics { x_m: at.x, y_m: at.y, z_m: at.z, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
@@ -76,7 +78,8 @@ pub fn drive(
             continue;
         };
         let truth = vehicle.truth_at(end_ns, RASTER_M.0, RASTER_M.1, &Limits::default());
-        judge(&pipeline, &extrinsics, points(pipeline.newest_sweep(), &truth));
+        let (points, known) = (points(pipeline.newest_sweep(), &truth), known_places(&truth));
+        judge(&pipeline, &extrinsics, FrameTruth { points: &points, whole: &points, known: &known })?;
         judged += 1;
         if judged == revolutions {
             break;
@@ -92,6 +95,22 @@ fn step(pipeline: &mut Pipeline, arrival_ns: i64, body: Body) -> Option<i64> {
     map.sensors.iter().all(|sensor| sensor.partial.is_empty()).then_some(map.capture_end_ns)
 }
 
+/// The places of the truth's raster on which no vehicle may stand, or perhaps none.
+fn known_places(truth: &TruthGrid) -> Vec<KnownPlace> {
+    let vote = |class: &Truth| match class {
+        Truth::Drivable | Truth::Outside => None,
+        Truth::Tight => Some(Vote::Either),
+        Truth::Unreachable => Some(Vote::Forbidden),
+        Truth::Steep => Some(Vote::Steep),
+        Truth::Obstacle => Some(Vote::Obstacle),
+    };
+    let place = |index: usize| <[f64; 2]>::from(truth.middle(index)).map(|place| place as f32);
+    (0..)
+        .zip(&truth.classes)
+        .filter_map(|(index, class)| Some(KnownPlace { place: place(index), vote: vote(class)? }))
+        .collect()
+}
+
 /// The truth about the points of a sweep.
 fn points(sweep: &Sweep, truth: &TruthGrid) -> Vec<JudgedPoint> {
     let place = |i: usize| [sweep.x[i], sweep.y[i], sweep.z[i]];
@@ -101,7 +120,8 @@ fn points(sweep: &Sweep, truth: &TruthGrid) -> Vec<JudgedPoint> {
 fn point(place: [f32; 3], truth: &TruthGrid) -> JudgedPoint {
     let [x, y] = [place[0], place[1]].map(f64::from);
     let Some(ground) = truth.height_at(x, y) else {
-        return JudgedPoint { place, class: "outside", vote: Vote::Nothing, road: false, ground: [Scored::Not; 2] };
+        let ground = [Scored::Not; 2];
+        return JudgedPoint { place, over_m: f32::NAN, class: "outside", vote: Vote::Nothing, road: false, ground };
     };
     let over = place[2] - ground;
     let here = truth.class_at(x, y);
@@ -119,5 +139,5 @@ fn point(place: [f32; 3], truth: &TruthGrid) -> JudgedPoint {
         Truth::Obstacle | Truth::Outside => Scored::Not,
         _ => Scored::Ground,
     };
-    JudgedPoint { place, class, vote, road: false, ground: [scored; 2] }
+    JudgedPoint { place, over_m: over, class, vote, road: false, ground: [scored; 2] }
 }
