@@ -14,7 +14,7 @@ classes! {
         /// An obstacle stands there, or the ground rises by a step.
         Occupied: "occupied", Occupied, 0xc42638;
         /// Something stands there that is higher than the vehicle's ground clearance and lower than an obstacle.
-        Low: "low", Occupied, 0xf4b842;
+        Low: "low", Low, 0xf4b842;
         /// The ground drops: a ditch, a trench, an edge.
         Drop: "drop", Occupied, 0xd070d8;
         /// Something nearer to the sensor hides the ground.
