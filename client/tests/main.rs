@@ -2,6 +2,7 @@
 
 mod common;
 mod footprint;
+mod questions;
 mod stream;
 mod view;
 #[cfg(feature = "zenoh")]

@@ -1,7 +1,7 @@
 """Maps of a Clearway server as numpy arrays.
 
-    for m in clearway.watch("localhost:50051", layers=["drivability"]):
-        print(m.sequence, m.age_ms(), m["drivability"].classes.shape)
+    for m in clearway.watch("localhost:50051", layers=["freespace"]):
+        print(m.sequence, m.age_ms(), m["freespace"].classes.shape)
 
 An address is `HOST:PORT` for gRPC, or `zenoh:ENDPOINT` (`zenoh:tcp/localhost:7447`, with certificates
 `zenoh:tls/localhost:7447`) for zenoh.
@@ -16,15 +16,18 @@ from . import over_grpc, over_zenoh
 from .errors import ClearwayError, DecodeError, ReplayEnded
 from .freshness import now_ns
 from .grid import CartesianGrid, RadialGrid
-from .map import Channel, Layer, LegendEntry, Map, Meaning, Obstacle, SafePoint
+from .map import Channel, Layer, LegendEntry, Map, Meaning, SafePoint
+from .questions import Along, Answer, Blocker, Obstacle
 from .recording import read
+from .shapes import Arc, Outline
 from .stream import MapStream, PassedOver
 from .tls import Tls
 from .v1 import map_pb2, service_pb2
 
 __all__ = [
-    "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer", "LegendEntry", "Map", "MapStream", "Meaning",
-    "Obstacle", "PassedOver", "RadialGrid", "SafePoint", "Tls", "get", "now_ns", "read", "vehicles", "watch",
+    "Along", "Answer", "Arc", "Blocker", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer",
+    "LegendEntry", "Map", "MapStream", "Meaning", "Obstacle", "Outline", "PassedOver", "RadialGrid", "SafePoint", "Tls",
+    "get", "now_ns", "read", "vehicles", "watch",
 ]  # fmt: skip
 
 

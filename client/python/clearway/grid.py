@@ -53,10 +53,14 @@ class RadialGrid:
 
     def centres(self) -> np.ndarray:
         """Centre of every cell, shape (rows, columns, 2)."""
-        outer = self.row_radius_m
-        range_m = 0.5 * (np.concatenate(([0.0], outer[:-1])) + outer)
-        azimuth = (np.arange(self.columns) + 0.5) / self.columns * math.tau
-        return range_m[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) + self.centre_m
+        return self.centres_of(np.arange(math.prod(self.shape))).reshape(*self.shape, 2)
+
+    def centres_of(self, cells: np.ndarray) -> np.ndarray:
+        """Centre of each of these cells (indices), shape (n, 2)."""
+        row, column = np.divmod(cells, self.columns)
+        range_m = 0.5 * (np.concatenate(([0.0], self.row_radius_m[:-1])) + self.row_radius_m)[row]
+        azimuth = (column + 0.5) / self.columns * math.tau
+        return range_m[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) + self.centre_m
 
 
 @dataclass(frozen=True)
@@ -101,10 +105,12 @@ class CartesianGrid:
 
     def centres(self) -> np.ndarray:
         """Centre of every cell in the ego frame, shape (height, width, 2)."""
-        x, y = np.meshgrid(
-            self.origin_x_m + (np.arange(self.width) + 0.5) * self.cell_m,
-            self.origin_y_m + (np.arange(self.height) + 0.5) * self.cell_m,
-        )
+        return self.centres_of(np.arange(self.width * self.height)).reshape(self.height, self.width, 2)
+
+    def centres_of(self, cells: np.ndarray) -> np.ndarray:
+        """Centre of each of these cells (indices) in the ego frame, shape (n, 2)."""
+        iy, ix = np.divmod(cells, self.width)
+        x, y = self.origin_x_m + (ix + 0.5) * self.cell_m, self.origin_y_m + (iy + 0.5) * self.cell_m
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
 

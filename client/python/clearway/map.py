@@ -23,6 +23,8 @@ from .errors import ClearwayError, DecodeError
 from .freshness import Arrival, Clock, now_ns
 from .grid import CartesianGrid, Grid, RadialGrid
 from .limits import MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX, RGB_MAX, SAFE_POINT_STEPS_MAX
+from .questions import BLOCKS, FREE, LOW, Along, Answer, Asked, Obstacle
+from .shapes import Arc, Outline
 from .v1 import map_pb2
 
 
@@ -85,20 +87,6 @@ class SafePoint(NamedTuple):
     links: tuple[int, ...]
 
 
-class Obstacle(NamedTuple):
-    """The nearest point of a cell that contains an obstacle. Ego frame, metres."""
-
-    x_m: float
-    y_m: float
-    #: Distance from the given point, in metres; 0 if the point lies in such a cell. No obstacle of the layer is nearer.
-    #: The
-    #: obstacle itself can be farther away by up to the size of the cell, because a map does not state where in a cell
-    #: it
-    #: stands. The innermost cells of a radial grid start at the vehicle's origin, so an obstacle in one is 0 m from
-    #: there.
-    distance_m: float
-
-
 class Layer:
     """One grid of a map, with one or more values per cell."""
 
@@ -156,30 +144,44 @@ class Layer:
         cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
         return math.nan if cell < 0 else float(self.channels[channel].values.flat[cell])
 
-    def is_free(self, footprint: Sequence[tuple[float, float]], step_m: float = 0.1) -> bool:
-        """True if every cell under a polygon (corners x, y in metres, ego frame) has a class that means free. The
-        polygon is sampled every `step_m` metres and at the centre of every cell."""
-        corners = np.asarray(footprint, dtype=np.float64)
-        if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
-            raise ClearwayError("footprint", f"footprint {footprint!r}: three or more finite corners (x, y) are needed")
-        points = _inside(corners, step_m)
-        cells = self.grid.cells_at(points[:, 0], points[:, 1])
-        # Cells smaller than a step, such as those of a radial grid near the vehicle, could lie between the points.
-        centres = self.grid.centres().reshape(-1, 2)
-        near = np.flatnonzero(((centres >= corners.min(axis=0)) & (centres <= corners.max(axis=0))).all(axis=1))
-        cells = np.concatenate([cells, near[_within(corners, centres[near])]])
-        return bool((cells >= 0).all() and self.free.ravel()[cells].all())
+    def is_free(self, polygon: Sequence[tuple[float, float]]) -> bool:
+        """True if every cell that a polygon (corners x, y in metres, ego frame) touches, its border included, has a
+        class that means free. A corner that is not finite, or edges that cross, raise a `ClearwayError`."""
+        return self.answer(polygon).verdict == "free"
 
-    def nearest_obstacle(self, x_m: float = 0.0, y_m: float = 0.0) -> Obstacle | None:
+    def answer(self, polygon: Sequence[tuple[float, float]]) -> Answer:
+        """Whether a vehicle may drive on a polygon, only if it clears low things, or not, and the cell nearest to the
+        ego origin that forbids it."""
+        return self._asked.answer(polygon)
+
+    def along(self, path: Arc | Sequence[tuple[float, float]], outline: Outline) -> Along:
+        """What a vehicle of this outline meets on a path (an arc, or places x, y in metres between which it drives
+        straight), judged at poses at most 0.1 m apart."""
+        return self._asked.along(path, outline)
+
+    def nearest_obstacle(self, x_m: float = 0.0, y_m: float = 0.0, own: Outline | None = None) -> Obstacle | None:
         """The obstacle of the layer that is nearest to a point (ego frame, metres); `None` if the layer has none. An
-        obstacle can also stand in an unknown cell."""
-        cells = np.flatnonzero(self.obstacles)
-        if not len(cells):
-            return None
-        places = self.grid.nearest(cells, x_m, y_m)
-        distances = np.hypot(places[:, 0] - x_m, places[:, 1] - y_m)
-        nearest = int(distances.argmin())
-        return Obstacle(*map(float, places[nearest]), float(distances[nearest]))
+        obstacle can also stand in an unknown cell. Cells whose centre lies within `own`, the outline of the vehicle
+        itself, do not count, nor do low things."""
+        return self._asked.nearest(self._of_classes(Meaning.OCCUPIED), x_m, y_m, own)
+
+    def nearest_low(self, x_m: float = 0.0, y_m: float = 0.0, own: Outline | None = None) -> Obstacle | None:
+        """The low thing that is nearest to a point, as `nearest_obstacle`."""
+        return self._asked.nearest(self._of_classes(Meaning.LOW), x_m, y_m, own)
+
+    def clearance(self, most_m: float = 10.0, passes_low: bool = False) -> np.ndarray:
+        """For each cell the distance in metres from its centre to the nearest point of a cell that is not free, at most
+        `most_m`, in the shape of the grid; 0 in such a cell. What lies outside the grid is not free, nor are low things,
+        unless `passes_low` is true: for a vehicle that clears them."""
+        return self._asked.clearance(most_m, passes_low)
+
+    @property
+    def _asked(self) -> Asked:
+        kinds = {Meaning.FREE: FREE, Meaning.LOW: LOW}
+        return Asked(self.grid, self.classes, self.legend, [kinds.get(e.meaning, BLOCKS) for e in self.legend_entries])
+
+    def _of_classes(self, meaning: Meaning) -> np.ndarray:
+        return np.array([entry.meaning == meaning for entry in self.legend_entries])
 
     def _channel(self, message: map_pb2.Channel, base: Layer | None) -> Channel:
         rows, columns = self.grid.shape
@@ -256,11 +258,11 @@ class Layer:
         return self.channels["class"]
 
     def _means(self, meaning: Meaning) -> np.ndarray:
-        return np.array([entry.meaning == meaning for entry in self.legend_entries])[self.classes]
+        return self._of_classes(meaning)[self.classes]
 
 
 class Map:
-    """A map, decoded and checked. `map["drivability"]` is a layer."""
+    """A map, decoded and checked. `map["freespace"]` is a layer."""
 
     def __init__(self, encoded: bytes, skipped: int = 0, base: Map | None = None) -> None:
         """`base`: the base map of layers that are deltas; whole layers do not need it."""
@@ -468,25 +470,3 @@ def _check_header(message: map_pb2.Map) -> None:
         norm = math.hypot(pose.qx, pose.qy, pose.qz, pose.qw)
         if not all(map(math.isfinite, (pose.x, pose.y, pose.z))) or not abs(norm - 1) <= 1e-3:
             raise DecodeError("header", f"map_from_ego {pose}: finite metres and a unit quaternion are needed")
-
-
-def _inside(corners: np.ndarray, step_m: float) -> np.ndarray:
-    """Points in and on a polygon, at most `step_m` metres apart."""
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    axes = [np.linspace(a, b, max(2, math.ceil((b - a) / step_m) + 1)) for a, b in zip(low, high)]
-    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    edges = []
-    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0)):
-        parts = max(2, math.ceil(math.hypot(bx - ax, by - ay) / step_m) + 1)
-        edges.append(np.linspace((ax, ay), (bx, by), parts))
-    return np.concatenate([grid[_within(corners, grid)], *edges])
-
-
-def _within(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """True for each point that lies in a polygon."""
-    within = np.zeros(len(points), dtype=bool)
-    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0)):
-        crosses = (ay > points[:, 1]) != (by > points[:, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            within ^= crosses & (points[:, 0] < (bx - ax) * (points[:, 1] - ay) / (by - ay) + ax)
-    return within

@@ -1,0 +1,289 @@
+"""Questions of a planner to one layer: whether an area or a path is free, what blocks it, what is nearest, and how far
+the next cell is that is not free.
+
+In: a grid with classes, and a polygon, a path or a point in the ego frame (x forward, y left, metres). Out: answers
+from the meanings in the layer's legend. They consider every cell that an area touches, its border included. Only the
+meaning free is free; ground outside the grid is not free. A low thing, which some vehicles clear, has an answer of its
+own. The Rust client gives the same answers (`client/golden/questions.json`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .errors import ClearwayError
+from .grid import CartesianGrid, Grid, RadialGrid
+from .shapes import Arc, Outline, Point, corners_of, finite, length, poses_of
+
+#: Distance in metres below which a point touches a cell: far more than the rounding errors of a point on a map.
+_TOUCH_M = 1e-9
+#: What a class is to a vehicle that drives onto it.
+FREE, LOW, BLOCKS = 0, 1, 2
+
+
+class Blocker(NamedTuple):
+    """A cell that is not free."""
+
+    #: Centre of the cell, in metres; of a place outside the grid, that place.
+    x_m: float
+    y_m: float
+    #: Name of its class; `unknown` outside the grid.
+    name: str
+    #: Why the cell has its class, if the map says it; `outside of the map` outside the grid.
+    why: str | None
+
+
+class Answer(NamedTuple):
+    """What a vehicle may do on an area."""
+
+    #: `free`: drive there. `low`: drive there if it clears low things. `blocked`: not drive there.
+    verdict: str
+    #: The cell nearest to the ego origin that forbids it; `None` if the area is free.
+    blocker: Blocker | None
+
+
+class Along(NamedTuple):
+    """What a vehicle meets on a path."""
+
+    #: Length of the path, in metres.
+    length_m: float
+    #: The first low thing and the distance along the path at which the vehicle touches it, in metres; `None` behind
+    #: the first cell that blocks.
+    low: tuple[float, Blocker] | None
+    #: The first cell that blocks and the distance along the path at which the vehicle touches it, in metres.
+    blocked: tuple[float, Blocker] | None
+
+
+class Obstacle(NamedTuple):
+    """The nearest point of a cell that contains an obstacle. Ego frame, metres."""
+
+    x_m: float
+    y_m: float
+    #: Distance from the given point, in metres; 0 if the point lies in such a cell. No obstacle of the layer is nearer.
+    #: The obstacle itself can be farther away by up to the size of the cell, because a map does not state where in a
+    #: cell it stands. The innermost cells of a radial grid start at the vehicle's origin, so an obstacle in one is 0 m
+    #: from there.
+    distance_m: float
+    #: Name of the cell's class.
+    name: str
+
+
+class Asked:
+    """One layer as questions see it."""
+
+    def __init__(self, grid: Grid, classes: np.ndarray, names: Sequence[str], kinds: Sequence[int], why=None) -> None:
+        self._grid, self._classes, self._names, self._why = grid, classes.ravel(), names, why
+        self._kinds = np.array([*kinds], dtype=np.int64)
+
+    def answer(self, polygon: Sequence[Point]) -> Answer:
+        return self._answer(corners_of(polygon), (0.0, 0.0))
+
+    def along(self, path: Arc | Sequence[Point], outline: Outline) -> Along:
+        outline.check()
+        poses = poses_of(path)
+        low = None
+        for pose in poses:
+            answer = self._answer(outline.at(pose.place, pose.heading_rad), pose.place)
+            if answer.verdict == "blocked":
+                return Along(poses[-1].along_m, low, (pose.along_m, answer.blocker))
+            if answer.verdict == "low" and low is None:
+                low = pose.along_m, answer.blocker
+        return Along(poses[-1].along_m, low, None)
+
+    def nearest(self, wanted: np.ndarray, x_m: float, y_m: float, own: Outline | None) -> Obstacle | None:
+        """The nearest point of a cell of a wanted class; cells with their centre within `own` do not count."""
+        x_m, y_m = finite("x_m", x_m), finite("y_m", y_m)
+        cells = np.flatnonzero(wanted[self._classes])
+        if own is not None:
+            own.check()
+            x, y = self._grid.centres_of(cells).T
+            cells = cells[~((x >= -own.rear_m) & (x <= own.front_m) & (abs(y) <= own.width_m / 2.0))]
+        if not len(cells):
+            return None
+        places = self._grid.nearest(cells, x_m, y_m)
+        distances = np.hypot(places[:, 0] - x_m, places[:, 1] - y_m)
+        nearest = int(distances.argmin())
+        name = self._names[self._classes[cells[nearest]]]
+        return Obstacle(*map(float, places[nearest]), float(distances[nearest]), name)
+
+    def clearance(self, most_m: float, passes_low: bool) -> np.ndarray:
+        most_m = length("most_m", most_m)
+        if not isinstance(self._grid, CartesianGrid):
+            raise ClearwayError("no_squares", "the layer has a radial grid; the clearance is computed on square cells alone")
+        height, width = self._grid.shape
+        kinds = self._kinds[self._classes].reshape(height, width)
+        free = (kinds == FREE) | (passes_low & (kinds == LOW))
+        reach = min(math.ceil(most_m / self._grid.cell_m + 0.5), height + width)
+        down = _steps_down(free, reach)
+        squared = np.full((height, width), np.iinfo(np.int64).max)
+        for by in range(min(reach, width) + 1):
+            away = _halves(by)
+            padded = np.zeros((height, width + 2 * by), dtype=np.int64)
+            padded[:, by : by + width] = _halves(down)
+            for shifted in (padded[:, :width], padded[:, 2 * by :]):
+                np.minimum(squared, shifted + away, out=squared)
+        return np.minimum(np.sqrt(squared.astype(np.float64)) * (self._grid.cell_m / 2.0), most_m)
+
+    def _answer(self, corners: list[Point], start: Point) -> Answer:
+        cells, outside = touched(self._grid, corners)
+        kinds = self._kinds[self._classes[cells]]
+        blocking = cells[kinds == BLOCKS]
+        if len(blocking):
+            return Answer("blocked", self._blocker(blocking, start))
+        if outside is not None:
+            return Answer("blocked", Blocker(*outside, "unknown", "outside of the map"))
+        low = cells[kinds == LOW]
+        return Answer("low", self._blocker(low, start)) if len(low) else Answer("free", None)
+
+    def _blocker(self, cells: np.ndarray, start: Point) -> Blocker:
+        centres = self._grid.centres_of(cells)
+        # To a micrometre, so that equal distances are equal in every client. The cells are ascending.
+        micrometres = np.floor(np.hypot(centres[:, 0] - start[0], centres[:, 1] - start[1]) * 1e6 + 0.5)
+        first = int(micrometres.argmin())
+        cell = int(cells[first])
+        why = None if self._why is None else self._why(cell)
+        return Blocker(*map(float, centres[first]), self._names[self._classes[cell]], why)
+
+
+def touched(grid: Grid, corners: list[Point]) -> tuple[np.ndarray, Point | None]:
+    """The cells that a simple polygon touches, ascending, and its first corner outside the grid or on the grid's
+    border; `None` if it lies inside. A cell is touched by an edge, or lies wholly inside; then the line through its
+    centre crosses the polygon there."""
+    if isinstance(grid, CartesianGrid):
+        cells, is_outside = _touched_squares(grid, np.array(corners))
+    else:
+        cells, is_outside = _touched_sectors(grid, np.array(corners) - grid.centre_m)
+    outside = next((corner for corner in corners if _leaves(grid, corner)), corners[0]) if is_outside else None
+    return cells, outside
+
+
+def _leaves(grid: Grid, corner: Point) -> bool:
+    x = corner[0] + 2 * _TOUCH_M * np.array([0.0, 1.0, -1.0, 0.0, 0.0])
+    y = corner[1] + 2 * _TOUCH_M * np.array([0.0, 0.0, 0.0, 1.0, -1.0])
+    return bool((grid.cells_at(x, y) < 0).any())
+
+
+class _Spans:
+    """Touched stretches of lines: in each line the cells from one to another."""
+
+    def __init__(self, lines: int, cells: int) -> None:
+        self._cells, self.is_outside = cells, False
+        self._borders = np.zeros((lines, cells + 1), dtype=np.int64)
+
+    def add(self, lines: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
+        self.is_outside |= bool((first < 0).any() or (last >= self._cells).any())
+        first, last = np.clip(first, 0, self._cells), np.clip(last + 1, 0, self._cells)
+        np.add.at(self._borders, (lines, first.astype(np.int64)), 1)
+        np.add.at(self._borders, (lines, last.astype(np.int64)), -1)
+
+    def mask(self) -> np.ndarray:
+        """True for each cell of each line that is touched."""
+        return self._borders.cumsum(axis=1)[:, :-1] > 0
+
+    def add_pairs(self, lines: np.ndarray, places: np.ndarray, to_cell) -> None:
+        """Adds the stretch from the first to the second of each pair of a line's places in their order."""
+        order = np.lexsort((places, lines))
+        lines, places = lines[order], places[order]
+        self.add(lines[::2], to_cell(places[::2]), to_cell(places[1::2]))
+
+
+def _touched_squares(grid: CartesianGrid, corners: np.ndarray) -> tuple[np.ndarray, bool]:
+    sin, cos = math.sin(grid.yaw_rad), math.cos(grid.yaw_rad)
+    x, y = corners[:, 0], corners[:, 1]
+    u = (x * cos - y * sin - grid.origin_x_m) / grid.cell_m
+    v = (x * sin + y * cos - grid.origin_y_m) / grid.cell_m
+    slack = _TOUCH_M / grid.cell_m
+    first, last = math.floor(v.min() - slack), math.floor(v.max() + slack)
+    rows = np.arange(max(first, 0), min(last, grid.height - 1) + 1)
+    spans, start = _Spans(len(rows), grid.width), max(first, 0)
+    crossings: list[tuple[np.ndarray, np.ndarray]] = []
+    for a, b in zip(np.stack([u, v], axis=-1), np.roll(np.stack([u, v], axis=-1), -1, axis=0)):
+        starts, ends, kept = _clip(*_repeated(a, b, len(rows)), 0.0, 1.0, rows - slack)
+        starts, ends, also = _clip(starts, ends, 0.0, -1.0, -(rows + 1.0 + slack))
+        kept &= also
+        low, high = np.minimum(starts[kept, 0], ends[kept, 0]), np.maximum(starts[kept, 0], ends[kept, 0])
+        spans.add(rows[kept] - start, np.floor(low - slack), np.floor(high + slack))
+        crossed = rows[(a[1] > rows + 0.5) != (b[1] > rows + 0.5)]
+        if len(crossed):
+            crossings.append((crossed - start, a[0] + (crossed + 0.5 - a[1]) / (b[1] - a[1]) * (b[0] - a[0])))
+    if crossings:
+        spans.add_pairs(*map(np.concatenate, zip(*crossings)), np.floor)
+    cells = start * grid.width + np.flatnonzero(spans.mask())
+    return cells, spans.is_outside or first < 0 or last >= grid.height
+
+
+def _touched_sectors(grid: RadialGrid, corners: np.ndarray) -> tuple[np.ndarray, bool]:
+    columns = np.arange(grid.columns)
+    sin, cos = (f(np.arange(grid.columns + 1) / grid.columns * math.tau) for f in (np.sin, np.cos))
+    middle_sin, middle_cos = (f((columns + 0.5) / grid.columns * math.tau) for f in (np.sin, np.cos))
+
+    def row(range_m: np.ndarray) -> np.ndarray:
+        return np.searchsorted(grid.row_radius_m, range_m, side="left")
+
+    spans = _Spans(grid.columns, len(grid.row_radius_m))
+    crossings: list[tuple[np.ndarray, np.ndarray]] = []
+    for a, b in zip(corners, np.roll(corners, -1, axis=0)):
+        starts, ends = _repeated(a, b, grid.columns)
+        kept = np.ones(grid.columns, dtype=bool)
+        if grid.columns > 1:
+            starts, ends, kept = _clip(starts, ends, -sin[:-1], cos[:-1], -_TOUCH_M)
+            starts, ends, also = _clip(starts, ends, sin[1:], -cos[1:], -_TOUCH_M)
+            kept &= also
+        starts, ends = starts[kept], ends[kept]
+        nearest = _nearest_to_origin(starts, ends)
+        farthest = np.maximum(np.hypot(*starts.T), np.hypot(*ends.T))
+        spans.add(columns[kept], row(np.hypot(*nearest.T) - _TOUCH_M), row(farthest + _TOUCH_M))
+        start, end = (middle_cos * p[1] - middle_sin * p[0] for p in (a, b))
+        crossed = np.flatnonzero((start > 0.0) != (end > 0.0))
+        share = start[crossed] / (start[crossed] - end[crossed])
+        x, y = a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])
+        range_m = x * middle_cos[crossed] + y * middle_sin[crossed]
+        crossings.append((crossed[range_m > 0.0], range_m[range_m > 0.0]))
+    lines, ranges = map(np.concatenate, zip(*crossings))
+    # An odd number of borders lies ahead of a centre inside the polygon.
+    inside = columns[np.bincount(lines, minlength=grid.columns) % 2 == 1]
+    spans.add_pairs(np.concatenate([lines, inside]), np.concatenate([ranges, np.zeros(len(inside))]), row)
+    return np.flatnonzero(spans.mask().T), spans.is_outside
+
+
+def _repeated(a: np.ndarray, b: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.tile(a, (count, 1)), np.tile(b, (count, 1))
+
+
+def _clip(a: np.ndarray, b: np.ndarray, nx, ny, offset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The parts of stretches where n . p >= offset, and which of them there are."""
+    # A border that is not finite belongs to a stretch that is left out.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        start, end = (nx * p[:, 0] + ny * p[:, 1] - offset for p in (a, b))
+        border = a + (start / (start - end))[:, None] * (b - a)
+    is_in, is_out = start >= 0.0, end >= 0.0
+    return np.where(is_in[:, None], a, border), np.where(is_out[:, None], b, border), is_in | is_out
+
+
+def _nearest_to_origin(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    d = b - a
+    squared = (d * d).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(squared > 0.0, np.clip(-(a * d).sum(axis=1) / squared, 0.0, 1.0), 0.0)
+    return a + share[:, None] * d
+
+
+def _halves(steps):
+    """Square of the half cells between a cell's centre and the nearest edge of the cell `steps` further on."""
+    halves = np.maximum(2 * steps - 1, 0)
+    return halves * halves
+
+
+def _steps_down(free: np.ndarray, reach: int) -> np.ndarray:
+    """For each cell the number of cells up or down its column to the nearest one that is not free, at most `reach`.
+    Outside the grid nothing is free."""
+    steps = np.where(free, reach, 0).astype(np.int64)
+    for rows in (range(len(steps)), reversed(range(len(steps)))):
+        before = np.zeros(steps.shape[1], dtype=np.int64)
+        for row in rows:
+            before = steps[row] = np.minimum(steps[row], before + 1)
+    return steps
