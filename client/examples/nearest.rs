@@ -6,12 +6,12 @@ use clearway_client::{Client, Subscription, now_ns};
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let address = std::env::args().nth(1).unwrap_or("localhost:50051".into());
-    let layers = vec!["terrain".into()];
+    let layers = vec!["freespace".into()];
     let mut maps = Client::connect(&address).await?.subscribe(Subscription { layers, ..Default::default() }).await?;
     loop {
         let map = maps.next().await?.map;
         let age_ms = map.age_ms(now_ns());
-        match map.nearest_obstacle("terrain", [0.0; 2], None)? {
+        match map.nearest_obstacle("freespace", [0.0; 2], None)? {
             Some(obstacle) => {
                 let bearing_deg = obstacle.bearing_rad.to_degrees();
                 let side = if bearing_deg < 0.0 { "right" } else { "left" };

@@ -3,8 +3,12 @@
 //! planned move. Each revolution makes one map and one move. The loop waits for each map and never for the clock, so
 //! that every run drives the same way.
 //!
-//! Two programs drive: A* on the layer `speed`, and the follower of the safe points on the layer `safe_path`.
+//! Three programs drive: A* on the layer `speed`, the follower of the safe points on the layer `safe_path`, and arcs over
+//! the layer `freespace`, by its answers alone.
 
+#[allow(dead_code, reason = "the example has a goal straight ahead")]
+#[path = "../../../client/examples/free_arcs/arcs.rs"]
+mod arcs;
 #[allow(dead_code, reason = "the example shows pictures")]
 #[path = "../../../client/examples/planner/astar.rs"]
 mod astar;
@@ -17,6 +21,7 @@ mod safe_points;
 use std::net::UdpSocket;
 use std::ops::Range;
 
+use arcs::ArcPlanner;
 use astar::Planner;
 use clearway_client::ingest::Ingester;
 use clearway_client::stream::MapStream;
@@ -85,6 +90,20 @@ impl Driver for Follower {
 
     fn next_move(&self, goal: [f64; 2]) -> Move {
         let motion::Move { curvature_per_m, mps, .. } = Follower::next_move(self, goal);
+        Move { curvature_per_m, mps }
+    }
+}
+
+impl Driver for ArcPlanner {
+    const LAYER: &'static str = "freespace";
+    const MEMORY: bool = true;
+
+    fn update(&mut self, map: &MapView) {
+        ArcPlanner::update(self, map);
+    }
+
+    fn next_move(&self, goal: [f64; 2]) -> Move {
+        let motion::Move { curvature_per_m, mps, .. } = ArcPlanner::next_move(self, goal).unwrap();
         Move { curvature_per_m, mps }
     }
 }
@@ -306,6 +325,14 @@ async fn drive<D: Driver>(plan: Plan, over_zenoh: bool) -> Driven {
 async fn a_planner_on_maps_of_grpc_and_zenoh_drives_a_lap_without_contact() {
     for plan in plans(lap(), OPPOSITE) {
         let driven = drive::<Planner>(plan, true).await;
+        assert!(driven.nearest_m > NEAREST_M_MIN, "{driven:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn arcs_over_freespace_alone_drive_without_contact() {
+    for plan in plans(OPPOSITE, lap()) {
+        let driven = drive::<ArcPlanner>(plan, false).await;
         assert!(driven.nearest_m > NEAREST_M_MIN, "{driven:?}");
     }
 }
