@@ -28,6 +28,7 @@ use super::shared::output::{print, print_line, usage_error};
 #[command(after_help = "Examples:
   clearway evaluate sequences/00
   clearway evaluate sequences/00 --variations all
+  clearway evaluate sequences/00 --objects
   clearway evaluate sequences/00 --set vehicle.maps.terrain.variant=paper
   clearway evaluate scans --labels truth --extrinsics 0,0,1.9,0,0,0 --model hdl32e --config car.toml
   clearway evaluate sim:town --json
@@ -59,6 +60,10 @@ pub struct EvaluateArguments {
     /// lasers16 (of 64), offset+1.5 (the sensor is 1.5 m ahead of the ego origin).
     #[arg(long, value_name = "NAME", value_delimiter = ',', default_value = "recorded")]
     variations: Vec<String>,
+    /// Cut objects into each labelled scan by ray geometry (a box, a log, a kerb, a person who lies, a pole, a trench, at
+    /// 7, 10, 15 and 20 m) and count their cells that are called free.
+    #[arg(long)]
+    objects: bool,
     /// Write each scan and its truth to this folder, for other programs, but not those of sim:NAME other than
     /// sim:random; files that exist are not replaced.
     #[arg(long, value_name = "DIR")]
@@ -117,6 +122,7 @@ pub fn run(arguments: EvaluateArguments) -> Result<Exit> {
         extrinsics,
         model,
         variations: names,
+        objects,
         write_scans,
         seeds,
         config,
@@ -124,7 +130,8 @@ pub fn run(arguments: EvaluateArguments) -> Result<Exit> {
         fail_under,
     } = arguments;
     let variations = variations(&names).map_err(usage_error)?;
-    let options = EvaluateOptions { paths, labels, extrinsics, model, variations, write_scans, seeds, config, set };
+    let options =
+        EvaluateOptions { paths, labels, extrinsics, model, variations, objects, write_scans, seeds, config, set };
     let shown = !json && std::io::stderr().is_terminal();
     let bar = if shown { ProgressBar::new(0) } else { ProgressBar::hidden() };
     let outcome = evaluate(&options, |done, total| {

@@ -156,6 +156,19 @@ fn patchwork_is_judged_on_the_same_points_as_the_maps() {
 }
 
 #[test]
+fn a_gate_on_footprints_decides_the_exit_code() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let gated = |gate: &str| {
+        let output = run(folder.path(), "clearway", &["evaluate", "sim:flat", "--fail-under", gate]);
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    assert_eq!(gated("safe_path=99@4-20"), (Some(0), String::new()));
+    let (code, said) = gated("terrain=99");
+    assert!(code == Some(1) && said.contains("sim:flat : terrain=99@4-20: "), "{code:?} {said}");
+    assert_eq!(gated("terrain=99@4-21").0, Some(3));
+}
+
+#[test]
 fn a_variant_of_the_papers_is_selected_without_a_configuration() {
     let report = |set: &[&str]| {
         let set = set.iter().map(|text| (*text).to_owned()).collect();

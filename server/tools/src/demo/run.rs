@@ -84,8 +84,8 @@ pub async fn demo(
     });
     let udp = running.inputs[0].udp.unwrap_or((nowhere, nowhere));
     let served = running.vehicles.0[0].clone();
-    // The picture and the line need this layer, whether or not a reader subscribes to it.
-    let _subscription = served.status.subscriptions.subscribe(&["drivability".to_owned()]);
+    // The picture and the line need these layers, whether or not a reader subscribes to them.
+    let _subscription = served.status.subscriptions.subscribe(&["freespace".to_owned(), "drivability".to_owned()]);
     // The car starts after everything else, so that its first firing is now.
     let car = DemoCar::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere), &served.newest)
         .context("the simulated car")?;
@@ -144,10 +144,10 @@ pub async fn demo(
     Ok(DemoSummary { last: DemoReport { snapshot: status.snapshot(), ..last }, sent })
 }
 
-/// Draws a map's drivability. A reader of the file sees a whole picture, either the old or the new one.
+/// Draws a map's free space. A reader of the file sees a whole picture, either the old or the new one.
 fn draw(map: &EncodedMap, file: &Path) -> Result<()> {
-    let map = decode_map(map.select(&["drivability".into()]), &Limits::default())?;
-    let Some(layer) = map.layer("drivability") else { return Ok(()) };
+    let map = decode_map(map.select(&["freespace".into()]), &Limits::default())?;
+    let Some(layer) = map.layer("freespace") else { return Ok(()) };
     let unfinished = file.with_extension("png.part");
     std::fs::write(&unfinished, picture::png(layer, &PictureStyle { pixels: 640, ..PictureStyle::default() })?)?;
     Ok(std::fs::rename(&unfinished, file)?)

@@ -247,7 +247,7 @@ fn is_free(meaning: Meaning) -> bool {
 }
 
 /// What the layer says about each cell; `None` if it has no free class.
-fn meanings(layer: &Layer) -> Option<Vec<Meaning>> {
+pub(super) fn meanings(layer: &Layer) -> Option<Vec<Meaning>> {
     let class = layer.channels.iter().find(|channel| channel.name == "class")?;
     if !layer.legend.iter().any(|class| is_free(class.meaning)) {
         return None;
@@ -264,7 +264,7 @@ fn meanings(layer: &Layer) -> Option<Vec<Meaning>> {
 }
 
 /// A function that finds the cell of a position in the ego frame, in metres.
-fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
+pub(super) fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
     match *geometry {
         Geometry::Radial { centre_m, ref row_radius_m, columns } => {
             let grid = RadialGrid::new(centre_m, row_radius_m.clone(), columns);

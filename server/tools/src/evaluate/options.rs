@@ -28,6 +28,8 @@ pub struct EvaluateOptions {
     pub model: Option<Model>,
     /// The variations of each labelled scan that are judged, in the order of the report.
     pub variations: Vec<Variation>,
+    /// True if objects are cut into each labelled scan as it was recorded, and their cells are counted.
+    pub objects: bool,
     /// Folder to which each scan and its truth is written, but not those of `sim:` other than `sim:random`.
     pub write_scans: Option<PathBuf>,
     /// Seeds of the random worlds.
@@ -46,6 +48,7 @@ impl Default for EvaluateOptions {
             extrinsics: None,
             model: None,
             variations: vec![Variation::Recorded],
+            objects: false,
             write_scans: None,
             seeds: SEEDS,
             config: None,

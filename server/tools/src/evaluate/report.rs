@@ -1,5 +1,7 @@
 //! The result of an evaluation, and the result as JSON. `table.rs` writes it as text.
 
+use std::collections::BTreeMap;
+
 use anyhow::Result;
 use clearway_client::MapView;
 use clearway_journal::encode::EncodedMap;
@@ -125,6 +127,9 @@ impl EvaluatedRow {
     }
 }
 
+/// Counts by object, distance in metres and layer: the cells with the object in them, and those called free.
+pub type ObjectCounts = BTreeMap<(&'static str, u32), Vec<(String, CellCount)>>;
+
 /// The counts of a layer, which are made if there are none.
 fn of<'a, T: Default>(layers: &'a mut Vec<(String, T)>, name: &str) -> &'a mut T {
     let at = layers.iter().position(|(layer, _)| layer == name).unwrap_or_else(|| {
@@ -159,6 +164,8 @@ pub struct EvaluatedSource {
     /// The counts of each variation, the first of which is the scans as they were recorded; or the sum of all worlds,
     /// then each type of world.
     pub rows: Vec<EvaluatedRow>,
+    /// The cells of objects that were cut into the scans.
+    pub objects: ObjectCounts,
     /// The random worlds, by seed.
     pub worlds: Vec<EvaluatedWorld>,
 }
@@ -213,6 +220,7 @@ impl Evaluation {
                 "maps": first.map(maps),
                 "left_out": first.map(|row| &row.left_out),
                 "rows": source.rows.iter().map(row).collect::<Vec<_>>(),
+                "objects": source.objects.iter().map(object).collect::<Vec<_>>(),
                 "worlds": source.worlds.iter().map(world).collect::<Vec<_>>(),
             })
         };
@@ -224,6 +232,15 @@ impl Evaluation {
             "sources": self.sources.iter().map(source).collect::<Vec<_>>(),
         })
     }
+}
+
+fn object(((name, distance_m), layers): (&(&'static str, u32), &Vec<(String, CellCount)>)) -> Value {
+    let of_layer = |(layer, count): &(String, CellCount)| json!({ "layer": layer, "cells": count.all, "called_free": count.of_them });
+    json!({
+        "object": name,
+        "distance_m": distance_m,
+        "layers": layers.iter().map(of_layer).collect::<Vec<_>>(),
+    })
 }
 
 fn row(row: &EvaluatedRow) -> Value {

@@ -24,6 +24,7 @@ impl Evaluation {
             source.mounts.iter().for_each(|mount| _ = writeln!(text, "  extrinsics {mount}"));
             write_layers(&mut text, source, first);
             write_footprints(&mut text, source);
+            write_objects(&mut text, source);
             write_worst(&mut text, source);
         }
         let _ = writeln!(
@@ -128,6 +129,16 @@ fn write_footprints(text: &mut String, source: &EvaluatedSource) {
             all(&tally.unreachable),
             refused.join(", ")
         );
+    }
+}
+
+/// A line for each object and distance: the cells with the object in them that each layer calls free, of all.
+fn write_objects(text: &mut String, source: &EvaluatedSource) {
+    for (index, ((object, distance_m), layers)) in source.objects.iter().enumerate() {
+        let of_layer = |(layer, count): &(String, CellCount)| format!("{layer} {}/{}", count.of_them, count.all);
+        let counts: Vec<String> = layers.iter().map(of_layer).collect();
+        let title = if index == 0 { "  free cells of objects cut into the scans\n" } else { "" };
+        let _ = writeln!(text, "{title}    {:<26} {}", format!("{object} at {distance_m} m"), counts.join(", "));
     }
 }
 

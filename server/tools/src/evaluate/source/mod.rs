@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`pairs`] | paths -> scans with their labels |
 //! | [`labels`] | labels -> the truth about the points of a scan |
+//! | [`objects`] | labelled scans with objects cut into them -> counts |
 //! | [`variation`] | a scan -> the same scan of a bent or rolled world, with fewer lasers, from another place |
 //! | [`scans`] | labelled scans and their variations -> counts |
 //! | [`written`] | a varied scan and its truth -> files for other programs |
@@ -11,6 +12,7 @@
 //! | [`random`] | seeds -> counts by type of world |
 
 pub mod labels;
+pub mod objects;
 pub mod pairs;
 pub mod random;
 pub mod scans;

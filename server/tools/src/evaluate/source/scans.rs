@@ -19,6 +19,7 @@ use super::super::judge::{JudgedPoint, Scored, Vote};
 use super::super::options::EvaluateOptions;
 use super::super::report::{EvaluatedSource, FrameTruth};
 use super::labels;
+use super::objects::judge_objects;
 use super::pairs::LabelledScan;
 use super::pipeline;
 use super::variation::Variation;
@@ -62,6 +63,9 @@ pub fn judge_folder(
         let scan = read_scan(&pair.scan, index)?;
         let classes = labels::read(&pair.labels, &pair.scan, scan.x.len())?;
         let truths = truth.points(&scan, &classes, index, &pair.scan)?;
+        if options.objects {
+            judge_objects(&scan, &truths, (maps, model, extrinsics), source)?;
+        }
         for (variation, made) in options.variations.iter().zip(&mut pipelines) {
             let row_name = variation.to_string();
             let varied = variation.apply(&scan, extrinsics).with_context(|| pair.scan.display().to_string())?;
@@ -150,7 +154,7 @@ impl TruthMaker {
     }
 }
 
-fn step(pipeline: &mut Pipeline, scan: Scan, sequence: u64, file: &Path) -> Result<()> {
+pub(super) fn step(pipeline: &mut Pipeline, scan: Scan, sequence: u64, file: &Path) -> Result<()> {
     let event = Event { sequence, arrival_ns: scan.stamp_ns, source: 0, body: Body::Scan(scan) };
     pipeline.step(&event).with_context(|| file.display().to_string())?;
     Ok(())
