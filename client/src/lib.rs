@@ -6,13 +6,13 @@
 //!
 //! # async fn plan() -> Result<(), clearway_client::ClientError> {
 //! let client = Client::connect("localhost:50051").await?;
-//! let mut maps = client.subscribe(Subscription { layers: vec!["drivability".into()], ..Default::default() }).await?;
+//! let mut maps = client.subscribe(Subscription { layers: vec!["freespace".into()], ..Default::default() }).await?;
 //! loop {
 //!     let update = maps.next().await?;
 //!     if update.map.is_stale(now_ns()) {
 //!         continue;
 //!     }
-//!     let (_, class) = update.map.layer("drivability")?.class_at(12.0, -1.5);
+//!     let (_, class) = update.map.layer("freespace")?.class_at(12.0, -1.5);
 //!     println!("12 m ahead, 1.5 m to the right: {class}; {} maps skipped", update.skipped);
 //! }
 //! # }

@@ -83,7 +83,7 @@ fn introduction(endpoints: &DemoEndpoints, record: Option<&Path>, picture: &Path
     for (name, value) in [
         ("page", format!("http://{page}/")),
         ("gRPC", format!("{grpc}   (clearway watch --server http://{grpc})")),
-        ("zenoh", format!("{}   (clearway/car/map/drivability)", zenoh.join(", "))),
+        ("zenoh", format!("{}   (clearway/car/map/freespace)", zenoh.join(", "))),
         ("sensors", sensors.clone()),
         ("recording", record),
         ("newest map", format!("{}   (drawn every second)", picture.display())),

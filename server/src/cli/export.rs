@@ -25,13 +25,13 @@ use super::tool_commands::progress_bar;
 /// unknown), markers and poses of the safe points, tf and odometry.
 #[derive(Args)]
 #[command(after_help = "Examples:
-  clearway export drive.mcap --layer drivability --format png --out maps
+  clearway export drive.mcap --layer freespace --format png --out maps
   clearway export drive.mcap --layer terrain --channel roughness --format png --out maps
   clearway export drive.mcap --format foxglove --out drive.foxglove.mcap")]
 pub struct ExportArguments {
     /// The recording (MCAP); a file that is cut off is exported as far as it goes.
     recording: PathBuf,
-    /// Layers, such as drivability, separated by commas; all if absent. `clearway info` lists those of a recording.
+    /// Layers, such as freespace, separated by commas; all if absent. `clearway info` lists those of a recording.
     #[arg(long = "layer", alias = "layers", value_name = "LAYER", value_delimiter = ',')]
     layers: Vec<String>,
     /// Format of the files.

@@ -28,7 +28,7 @@ const WAIT_MAX: Duration = Duration::from_secs(86_400);
 #[command(after_help = "Examples:
   clearway get
   clearway get --wait
-  clearway get --layer drivability --out newest.png
+  clearway get --layer freespace --out newest.png
   clearway get --layer occupancy --out newest.npy
   clearway get --json")]
 pub struct GetArguments {

@@ -18,7 +18,7 @@ use crate::cli::shared::output::{block_on, counted, print_line};
 const STALE_PERIOD: Duration = Duration::from_secs(1);
 /// The layer that is read over zenoh if none is named.
 #[cfg(feature = "zenoh")]
-const DEFAULT_LAYER: &str = "drivability";
+const DEFAULT_LAYER: &str = "freespace";
 /// Interval at which the age of the last map is read after the stream has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
@@ -30,7 +30,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
-  clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 5
+  clearway watch --server vehicle.local:50051 --layers freespace,occupancy --max-rate-hz 5
   clearway watch --count 10 --json
   clearway watch --until-stale || echo \"the maps are stale\"")]
 pub struct WatchArguments {
@@ -46,7 +46,7 @@ pub struct WatchArguments {
     /// The vehicle, if the server has several.
     #[arg(long, value_name = "NAME")]
     vehicle: Option<String>,
-    /// Layers, separated by commas; all if absent. Over zenoh one layer; drivability if absent.
+    /// Layers, separated by commas; all if absent. Over zenoh one layer; freespace if absent.
     #[arg(long, alias = "layer", value_name = "LAYER", value_delimiter = ',')]
     layers: Vec<String>,
     /// Greatest number of maps a second; every map if absent.

@@ -139,7 +139,7 @@ export class FleetView {
     if (is_wanted === card.is_wanted || is_elsewhere || !card.status.layers?.length) return;
     card.is_wanted = is_wanted;
     if (is_kept) return;
-    const { layers, name } = card.status, layer = layers.includes("drivability") ? "drivability" : layers[0];
+    const { layers, name } = card.status, layer = layers.includes("freespace") ? "freespace" : layers[0];
     const side = Math.round(MAP_PX * Math.min(devicePixelRatio, SCALE_MAX));
     this.#post({
       type: "want", vehicle: name,
