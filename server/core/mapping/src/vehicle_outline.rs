@@ -12,6 +12,12 @@ pub struct Outline {
 }
 
 impl Outline {
+    /// The outline with a margin on all sides.
+    pub fn grown_by(&self, margin_m: f32) -> Self {
+        let Self { width_m, front_m, rear_m } = *self;
+        Self { width_m: width_m + 2.0 * margin_m, front_m: front_m + margin_m, rear_m: rear_m + margin_m }
+    }
+
     /// True if a position lies within the outline.
     #[inline(always)]
     pub fn contains(&self, x: f32, y: f32) -> bool {

@@ -99,6 +99,16 @@ impl Ground {
         self.cells.point_coordinates()[1]
     }
 
+    /// The lowest returns of the polar cells.
+    pub(crate) fn cells(&self) -> &PolarCells {
+        &self.cells
+    }
+
+    /// Height of the ground at the middle of a polar cell, metres; the near plane's where no ground was seen.
+    pub(crate) fn surface_m(&self, polar: usize) -> f32 {
+        self.surface.heights_m()[polar]
+    }
+
     /// By polar cell; see [`polar`].
     pub fn confidences(&self) -> &[Confidence] {
         self.surface.confidences()

@@ -68,6 +68,16 @@ impl Bits {
         self.words.iter_mut().zip(&other.words).for_each(|(word, other)| *word |= other);
     }
 
+    /// Clears the bit of a cell.
+    pub fn clear_cell(&mut self, ix: usize, iy: usize) {
+        self.words[iy * self.stride + ix / 64] &= !(1 << (ix % 64));
+    }
+
+    /// Replaces each bit by its complement.
+    pub fn invert(&mut self) {
+        self.words.iter_mut().for_each(|word| *word = !*word);
+    }
+
     /// Clears the bits that are set in an equally large square.
     pub fn remove(&mut self, other: &Self) {
         self.words.iter_mut().zip(&other.words).for_each(|(word, other)| *word &= !other);
@@ -84,8 +94,14 @@ impl Bits {
     }
 
     /// Calls `each` with each cell whose bit is set, row by row.
-    pub fn each(&self, mut each: impl FnMut(usize, usize)) {
-        for (at, word) in self.words.iter().enumerate() {
+    pub fn each(&self, each: impl FnMut(usize, usize)) {
+        self.each_in(0..self.words.len() / self.stride, each);
+    }
+
+    /// The same for the cells of some rows.
+    pub fn each_in(&self, rows: Range<usize>, mut each: impl FnMut(usize, usize)) {
+        let words = rows.start * self.stride..rows.end * self.stride;
+        for (at, word) in words.clone().zip(&self.words[words]) {
             let mut rest = *word;
             while rest != 0 {
                 each(at % self.stride * 64 + rest.trailing_zeros() as usize, at / self.stride);

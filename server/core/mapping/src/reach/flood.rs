@@ -64,9 +64,9 @@ impl Flood {
         self.covered.get(ix, iy)
     }
 
-    /// The cells that the disc covers, 64 a word.
-    pub fn reached(&self) -> &[u64] {
-        self.covered.words()
+    /// The cells that the disc covers.
+    pub fn covered(&self) -> &Bits {
+        &self.covered
     }
 
     /// True if the middle of the disc gets to the cell.

@@ -19,13 +19,13 @@
 //! | open and closed cells -> reached cells | `flood` |
 //! | reached cells -> those without a detour over farther ground | `directions` |
 
-mod bits;
+pub(crate) mod bits;
 mod blind_zone;
 pub(crate) mod cells;
 pub mod config;
 mod directions;
 mod edges;
-mod flood;
+pub(crate) mod flood;
 mod joins;
 mod obstacles;
 mod polar_runs;
@@ -58,6 +58,12 @@ const CHUNK: usize = 1024;
 /// Least height that an obstacle's returns span if it casts a shadow, metres. Ours: kerbs cast none; not tuned.
 const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
 
+/// Height over the ground below which a return shows the ground and its steps, metres. Ours: it is no obstacle to any
+/// vehicle; a higher one, whatever obstacles the vehicle drives over, is the side of a thing and no step.
+const GROUND_M_MAX: f32 = 0.25;
+/// Half the width of a shadow that is open, in cells. Ours: half a metre to each side.
+const CLOSING: usize = 2;
+
 /// Greatest width of the strip under the vehicle that is open without a return, metres. Ours: narrower than a car.
 const STRIP_M: f32 = 1.0;
 
@@ -71,8 +77,9 @@ enum View {
     Clear = 0b01,
     /// It does where no obstacle casts a shadow on it.
     BesideObstacle = 0b10,
-    /// It does not, because an obstacle hides it.
+    /// It does not, because an obstacle hides it: where no ground is known, and in a gap of seen ground.
     Hidden = 0b100,
+    HiddenGap = 0b1100,
 }
 
 /// Cell of [`Reach`] that contains a position; [`ReachCell::at`] finds it once for a fixed position.
@@ -93,17 +100,19 @@ impl ReachCell {
     }
 }
 
-/// What the reach stage knows of its cells: a bit each, 64 cells a word, the first cell in the lowest bit, row by row.
+/// What the reach stage knows of its cells, a bit each.
 #[derive(Clone, Copy)]
-pub(crate) struct ReachRows<'a> {
-    /// The vehicle gets there: the disc covers the cell somewhere on its path.
-    pub reached: &'a [u64],
+pub(crate) struct ReachBits<'a> {
     /// An obstacle stands there, or a step of the ground ends there.
-    pub closed: &'a [u64],
+    pub closed: &'a Bits,
     /// Ground that was seen, or that lies in a gap of seen ground which no obstacle hides.
-    pub open: &'a [u64],
+    pub open: &'a Bits,
     /// Unseen ground behind or right beside an obstacle.
-    pub hidden: &'a [u64],
+    pub hidden: &'a Bits,
+    /// The cells in a trough of the ground.
+    pub in_trough: &'a Bits,
+    /// The cells with a return from the ground.
+    pub seen: &'a Bits,
 }
 
 /// Closed cells and reached ground around the vehicle, ego frame.
@@ -126,7 +135,16 @@ pub struct Reach {
     open: Bits,
     /// The cells whose ground an obstacle hides.
     hidden: Bits,
+    /// The cells of `hidden` that lie in a gap of seen ground.
+    hidden_gaps: Bits,
     closed: Bits,
+    /// The closed cells beside a step of the ground, and those in a trough.
+    stepped: Bits,
+    in_trough: Bits,
+    /// Buffers of the closing of open ground.
+    dilated: Bits,
+    outside: Bits,
+    wide: Vec<u64>,
     joins: Joins,
     blind_zone: BlindZone,
     edges: Edges,
@@ -157,7 +175,13 @@ impl Reach {
             views: vec![View::Closed; CELLS],
             open: bits.clone(),
             hidden: bits.clone(),
+            hidden_gaps: bits.clone(),
             closed: bits.clone(),
+            stepped: bits.clone(),
+            in_trough: bits.clone(),
+            dilated: bits.clone(),
+            outside: bits.clone(),
+            wide: Vec::new(),
             joins: Joins::new(),
             blind_zone: BlindZone::new(),
             edges: Edges::new(),
@@ -177,9 +201,17 @@ impl Reach {
         self.sort_points(sweep, ground.heights_m());
         self.closed.clear();
         let closed = &mut self.closed;
-        self.steps.find(&self.config, |cell| closed.set(cell % SIDE, cell / SIDE));
-        let steps = &self.steps;
-        self.troughs.find(steps.seen(), |cell| steps.low_mm(cell), |ix, iy| closed.set(ix, iy));
+        let stepped = &mut self.stepped;
+        stepped.clear();
+        self.steps.find(self.config.step_m_max, SIDE / 2, |higher, lower| {
+            stepped.set(higher % SIDE, higher / SIDE);
+            stepped.set(lower % SIDE, lower / SIDE);
+        });
+        let (steps, in_trough) = (&self.steps, &mut self.in_trough);
+        in_trough.clear();
+        self.troughs.find(steps.seen(), |cell| steps.low_mm(cell), |ix, iy| in_trough.set(ix, iy));
+        closed.add(stepped);
+        closed.add(in_trough);
         self.barred.copy_from(closed);
         let barred = &mut self.barred;
         self.joins.find(closed, &self.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
@@ -196,8 +228,7 @@ impl Reach {
             barred.set(cell % SIDE, cell / SIDE);
         }
         self.open_seen_ground(sweep.mount_height_m, ground.confidences());
-        // Radius, in cells, of the largest disc sure to fit through a passage of the vehicle's width.
-        let radius = ((self.config.vehicle_width_m / CELL_M - 2.0) / 2.0).max(0.0) as usize;
+        let radius = self.disc_radius();
         self.flood.run(&self.open, &self.barred, radius, self.directions.near());
         self.directions.close(&self.open, &mut self.flood);
     }
@@ -217,9 +248,10 @@ impl Reach {
                     continue;
                 }
                 // NaN fails every comparison.
-                if height < obstacle_m_min {
+                if height < GROUND_M_MAX {
                     self.steps.add_point(cell, z, height);
-                } else if height <= overhang_m && !outline.contains(x, y) {
+                }
+                if height >= obstacle_m_min && height <= overhang_m && !outline.contains(x, y) {
                     self.obstacles.add_point(cell, height);
                 }
             }
@@ -247,14 +279,67 @@ impl Reach {
         cell.index().is_some_and(|cell| self.flood.is_reached(cell % SIDE, cell / SIDE))
     }
 
-    /// Closed cells and reached ground as rows of bits.
-    pub(crate) fn rows(&self) -> ReachRows<'_> {
-        ReachRows {
-            reached: self.flood.reached(),
-            closed: self.closed.words(),
-            open: self.open.words(),
-            hidden: self.hidden.words(),
+    /// The cells with a return from the ground in the newest map itself, not in its memory.
+    pub(crate) fn seen_now(&self) -> &Bits {
+        self.steps.seen()
+    }
+
+    /// Closed cells and reached ground as bits.
+    pub(crate) fn bits(&self) -> ReachBits<'_> {
+        ReachBits {
+            closed: &self.closed,
+            open: &self.open,
+            hidden: &self.hidden,
+            in_trough: &self.in_trough,
+            seen: self.steps.seen(),
         }
+    }
+
+    /// The cells that are neither open nor filled by a closing of the open cells.
+    pub(crate) fn outside(&self) -> &Bits {
+        &self.outside
+    }
+
+    /// By cell: lowest and highest return from the ground, millimetres, ego frame; the lowest is the larger number
+    /// without one.
+    pub(crate) fn ground_spans_mm(&self) -> &[[i16; 2]] {
+        self.steps.spans_mm()
+    }
+
+    /// Calls `mark` with the higher cell of each step of the ground of at least this height, up to `near` cells from the
+    /// middle.
+    pub(crate) fn each_step(&self, least_m: f32, near: usize, mut mark: impl FnMut(usize)) {
+        self.steps.find(least_m, near, |higher, _| mark(higher));
+    }
+
+    /// Writes the closed cells that only a step closes.
+    pub(crate) fn only_stepped(&self, cells: &mut Bits) {
+        cells.copy_from(&self.stepped);
+        cells.remove(&self.in_trough);
+        self.obstacles.cells().for_each(|(cell, _)| cells.clear_cell(cell % SIDE, cell / SIDE));
+    }
+
+    /// Lowest and highest height over the ground that the obstacle of a cell spans, metres; `None` without one.
+    pub(crate) fn obstacle_span_m(&self, cell: usize) -> Option<[f32; 2]> {
+        Some(self.obstacles.span_m(cell)).filter(|[low, high]| low <= high)
+    }
+
+    /// The polar cell of a cell's centre.
+    pub(crate) fn polar(&self, cell: usize) -> PolarIndex {
+        self.polar_of_cell[cell]
+    }
+
+    /// Floods the ground again with more barred cells; `flood` and `barred` are the caller's.
+    pub(crate) fn flood_with(&self, barriers: [&Bits; 2], barred: &mut Bits, flood: &mut Flood) {
+        barred.copy_from(&self.barred);
+        barriers.into_iter().for_each(|barrier| barred.add(barrier));
+        flood.run(&self.open, barred, self.disc_radius(), self.directions.near());
+        self.directions.close(&self.open, flood);
+    }
+
+    /// Radius, in cells, of the largest disc sure to fit through a passage of the vehicle's width.
+    fn disc_radius(&self) -> usize {
+        ((self.config.vehicle_width_m / CELL_M - 2.0) / 2.0).max(0.0) as usize
     }
 
     /// Opens the cells with a return from the ground, and the unseen ones between them. Unseen ground right behind an
@@ -271,11 +356,13 @@ impl Reach {
             }
         }
         self.classify_polar_cells(confidences);
-        let (runs, shadow, views, hidden) = (&self.polar_runs, &self.shadow, &self.views, &mut self.hidden);
+        let (runs, shadow, views) = (&self.polar_runs, &self.shadow, &self.views);
+        let (hidden, gaps) = (&mut self.hidden, &mut self.hidden_gaps);
         self.open.fill_words(|cells| {
             let view_of = |polar: PolarIndex| polar.of(views).map_or(View::Closed as u8, |view| *view as u8);
-            let [mut clear, mut beside, behind] = runs.bits(cells.start / WORD, view_of);
+            let [mut clear, mut beside, behind, gap] = runs.bits(cells.start / WORD, view_of);
             hidden.set_word(cells.start / WORD, behind | beside);
+            gaps.set_word(cells.start / WORD, gap | beside);
             while beside != 0 {
                 let bit = beside.trailing_zeros() as usize;
                 clear |= u64::from(!shadow.hides(cells.start + bit)) << bit;
@@ -283,11 +370,25 @@ impl Reach {
             }
             clear
         });
-        self.hidden.remove(&self.open);
         self.open.add(self.steps.seen());
+        self.open_thin_shadows();
+        self.hidden.remove(&self.open);
         for cell in &self.under_vehicle {
             self.open.set(cell % SIDE, cell / SIDE);
         }
+    }
+
+    /// Opens the hidden cells in gaps of seen ground that a closing of the open cells fills: the thin shadows of trunks
+    /// and bushes, which would cut the way of the disc's middle.
+    fn open_thin_shadows(&mut self) {
+        let Self { open, hidden_gaps, dilated, outside, wide, .. } = self;
+        dilated.clear();
+        dilated.dilate(open, CLOSING, wide);
+        dilated.invert();
+        outside.clear();
+        outside.dilate(dilated, CLOSING, wide);
+        hidden_gaps.remove(outside);
+        self.open.add(&self.hidden_gaps);
     }
 
     /// Decides for each polar cell whether its unseen ground counts as free of obstacles.
@@ -298,7 +399,8 @@ impl Reach {
                 let cell = row * COLUMNS + column;
                 is_hidden = self.has_obstacle[cell] || is_hidden && confidences[cell] != Confidence::Seen;
                 self.views[cell] = match confidences[cell] {
-                    Confidence::Bridged | Confidence::Extrapolated | Confidence::None if is_hidden => View::Hidden,
+                    Confidence::Bridged if is_hidden => View::HiddenGap,
+                    Confidence::Extrapolated | Confidence::None if is_hidden => View::Hidden,
                     Confidence::Seen | Confidence::Bridged if self.is_beside_obstacle(row, column) => {
                         View::BesideObstacle
                     }

@@ -46,6 +46,12 @@ impl Obstacles {
         self.spans_m[cell][1] - self.spans_m[cell][0]
     }
 
+    /// Lowest and highest height of a cell's returns over the ground, metres; the lowest is the larger number without an
+    /// obstacle.
+    pub fn span_m(&self, cell: usize) -> [f32; 2] {
+        self.spans_m[cell]
+    }
+
     /// The cells with an obstacle, and the heights over the ground that it spans, metres.
     pub fn cells(&self) -> impl Iterator<Item = (usize, [f32; 2])> {
         self.found.iter().map(|cell| (*cell as usize, self.spans_m[*cell as usize]))

@@ -5,7 +5,7 @@
 
 use super::bits::Bits;
 use super::cells::{CELL_M, SIDE};
-use super::config::{ReachConfig, STEP_SLOPE_MIN};
+use super::config::STEP_SLOPE_MIN;
 
 /// Lowest height over the ground of a return that is used, metres. Ours: lower ones are mirror images.
 const LOWEST_M: f32 = -1.5;
@@ -47,33 +47,46 @@ impl Steps {
         }
     }
 
-    /// Calls `mark` with each cell beside a step.
-    pub fn find(&self, config: &ReachConfig, mut mark: impl FnMut(usize)) {
-        let least_mm = (config.step_m_max * 1000.0) as i32;
+    /// Calls `mark` with the higher and the lower cell of each step of at least this height, up to `near` cells from the
+    /// middle; both are the same for a step within a cell.
+    pub fn find(&self, least_m: f32, near: usize, mut mark: impl FnMut(usize, usize)) {
+        let least_mm = (least_m * 1000.0) as i32;
         let reaches = NEAR.map(|[dx, dy]| {
             let distance_m = CELL_M * ((dx * dx + dy * dy) as f32).sqrt();
             (dy * SIDE as isize + dx, least_mm.max((STEP_SLOPE_MIN * distance_m * 1000.0) as i32))
         });
-        self.seen.each(|ix, iy| {
-            // The outermost cells are compared with fewer others.
-            if !(2..SIDE - 2).contains(&ix) || iy >= SIDE - 2 {
+        let near = SIDE / 2 - near..SIDE / 2 + near;
+        // The outermost cells are compared with fewer others.
+        let columns = near.start.max(2)..near.end.min(SIDE - 2);
+        self.seen.each_in(near.start..near.end.min(SIDE - 2), |ix, iy| {
+            if !columns.contains(&ix) {
                 return;
             }
             let cell = iy * SIDE + ix;
             let [low, high] = self.spans[cell].map(i32::from);
             if high - low >= least_mm {
-                mark(cell);
+                mark(cell, cell);
             }
             for (offset, least_mm) in reaches {
                 let other = cell.wrapping_add_signed(offset);
                 let span = self.spans[other];
                 let [other_low, other_high] = span.map(i32::from);
-                if span != EMPTY && (high - other_low).max(other_high - low) >= least_mm {
-                    mark(cell);
-                    mark(other);
+                if span == EMPTY {
+                    continue;
+                }
+                if high - other_low >= least_mm {
+                    mark(cell, other);
+                }
+                if other_high - low >= least_mm {
+                    mark(other, cell);
                 }
             }
         });
+    }
+
+    /// By cell: lowest and highest return from the ground, millimetres.
+    pub fn spans_mm(&self) -> &[[i16; 2]] {
+        &self.spans
     }
 
     /// Height of the lowest return from the ground of a cell, millimetres; the largest number without one.
@@ -94,7 +107,6 @@ mod tests {
 
     #[test]
     fn a_step_is_as_high_as_configured_and_as_steep_as_configured_in_every_direction() {
-        let config = ReachConfig { step_m_max: 0.2, ..ReachConfig::default() };
         for [dx, dy] in NEAR.into_iter().flat_map(|[dx, dy]| [[dx, dy], [-dx, -dy]]) {
             let apart = [dx, dy].map(|cells| CELL_M * cells as f32);
             let least_m = 0.2_f32.max(0.5 * libm::hypotf(apart[0], apart[1]));
@@ -102,7 +114,7 @@ mod tests {
                 let (mut steps, mut marked) = (Steps::new(), std::collections::BTreeSet::new());
                 steps.add_point(cell(5.1, 3.1), 0.0, 0.0);
                 steps.add_point(cell(5.1 + apart[0], 3.1 + apart[1]), height_m, 0.0);
-                steps.find(&config, |cell| marked.extend([cell]));
+                steps.find(0.2, SIDE / 2, |higher, lower| marked.extend([higher, lower]));
                 assert_eq!(marked.len(), expected, "{height_m} m high, {dx} and {dy} cells apart");
             }
         }

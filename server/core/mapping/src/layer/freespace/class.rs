@@ -1,5 +1,6 @@
 //! Classes and channels of the layer `freespace`.
 
+use crate::layer::channel::TypedChannel;
 use crate::layer::class::classes;
 
 classes! {
@@ -22,4 +23,34 @@ classes! {
         /// Ground, but the vehicle does not fit through to it.
         NotReached: "not_reached", NotReached, 0xaa803c;
     }
+}
+
+/// Height of the cell's highest return over the ground, overhangs aside.
+pub const HEIGHT: TypedChannel<i8> = TypedChannel { name: "height", unit: "m", scale: 0.05, unknown: i8::MIN };
+
+/// Why the cell has its class: a [`Reason`].
+pub const WHY: TypedChannel<u8> = TypedChannel { name: "why", unit: "id", scale: 1.0, unknown: 0 };
+
+/// Values of the channel `why`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Reason {
+    /// No return was seen there, nor ground around it.
+    NotSeen = 0,
+    /// A return of this map shows the ground.
+    Seen = 1,
+    /// No return fell into it; it lies in a gap of seen ground.
+    Bridged = 2,
+    /// A return of an earlier map shows the ground.
+    Remembered = 3,
+    /// The ground rises or falls by a step.
+    Step = 4,
+    /// Something stands there.
+    Obstacle = 5,
+    /// Something hangs there, too low to pass under.
+    Overhang = 6,
+    /// A ditch, a trench or an edge down.
+    Ditch = 7,
+    /// The vehicle does not fit through to it.
+    TooNarrow = 8,
 }

@@ -8,11 +8,15 @@ use serde::{Deserialize, Serialize};
 pub struct FreespaceConfig {
     /// True if the layer is made.
     pub enabled: bool,
+    /// True if the layer has the channel `height`.
+    pub height: bool,
+    /// True if the layer has the channel `why`.
+    pub why: bool,
 }
 
 impl Default for FreespaceConfig {
     fn default() -> Self {
-        Self { enabled: true }
+        Self { enabled: true, height: false, why: false }
     }
 }
 

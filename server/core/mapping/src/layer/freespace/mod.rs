@@ -1,82 +1,170 @@
 //! The layer `freespace`, the one to plan on: where the whole vehicle can drive. Not in the papers.
 //!
-//! In: what the vehicle can reach ([`Reach`](crate::reach::Reach)), by cell of 0.25 m to 64 m, ego frame. Out: the
-//! layer on the same cells. A cell is free if the vehicle gets there and nothing closes it, whether a return fell into
-//! it or into the seen ground around it; the papers' layers know only cells with a return. The vehicle's own outline is
-//! never occupied. Without a local ground all other cells are unknown.
+//! In: the local ground, and what the vehicle can reach on it ([`Reach`]), by cell of 0.25 m to 64 m, ego frame. Out:
+//! the layer on the same cells. The papers' layers judge a cell only if a return fell into it; here a cell is free if
+//! the vehicle gets there and nothing closes it, whether a return fell into it or into the seen ground around it. The
+//! vehicle's own outline is never occupied. Without a local ground all other cells are unknown. The steps:
+//!
+//! | step | where |
+//! |---|---|
+//! | what stands over the ground on both sides of it -> low cells | `low_things` |
+//! | returns that lie deeper than the ground before them -> cells of drops | `drops` |
+//! | the reach stage's flood, with these cells as barriers -> covered cells | [`crate::reach`] |
+//! | even cells beside a step -> free cells | `releases` |
+//! | all of it -> the class of each cell, and if configured its height and its reason | `cells` |
 
+mod cells;
 pub mod class;
 pub mod config;
+mod drops;
+mod low_things;
+mod releases;
 
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::count_cells;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};
-use crate::reach::ReachRows;
+use crate::reach::Reach;
+use crate::reach::bits::Bits;
 use crate::reach::cells::{CELL_M, SIDE, centre_m};
 use crate::reach::config::ReachConfig;
+use crate::reach::flood::Flood;
 use crate::sensor::sweep::Sweep;
+use crate::vehicle_outline::Outline;
 
-use class::FreespaceClass;
+use cells::Findings;
+use class::{FreespaceClass, HEIGHT, WHY};
 use config::FreespaceConfig;
+use drops::Drops;
+use low_things::LowThings;
 
-/// Number of cells of a word of bits.
-const WORD: usize = 64;
+/// Distance to the vehicle's outline within which nothing is low and no drop is found, metres. Ours: the returns of the
+/// vehicle's own sides.
+const OWN_M: f32 = 0.5;
 
-/// Maker of the layer `freespace`.
+/// Maker of the layer `freespace`. It reuses its buffers.
 #[derive(Clone)]
-pub struct Freespace {}
+pub struct Freespace {
+    config: FreespaceConfig,
+    low_things: LowThings,
+    drops: Drops,
+    flood: Flood,
+    barred: Bits,
+    low: Bits,
+    drop: Bits,
+    free: Bits,
+    /// The cells that only a step closes; those of them that are free.
+    stepped: Bits,
+    released: Bits,
+    /// The outline whose cells are known, the cells in it, and the cells in it and around it.
+    outline: Outline,
+    vehicle: Vec<usize>,
+    own: Bits,
+}
 
 impl Freespace {
     /// A maker with validated parameters.
-    pub fn new(_config: &FreespaceConfig) -> Self {
-        Self {}
+    pub fn new(config: &FreespaceConfig) -> Self {
+        let bits = Bits::square(SIDE);
+        let mut freespace = Self {
+            config: config.clone(),
+            low_things: LowThings::new(),
+            drops: Drops::new(),
+            flood: Flood::new(SIDE),
+            barred: bits.clone(),
+            low: bits.clone(),
+            drop: bits.clone(),
+            free: bits.clone(),
+            stepped: bits.clone(),
+            released: bits.clone(),
+            outline: ReachConfig::default().outline(),
+            vehicle: Vec::new(),
+            own: bits,
+        };
+        freespace.set_outline(freespace.outline);
+        freespace
     }
 
     fn geometry() -> Geometry {
         Geometry::about_vehicle(SIDE as u32, CELL_M)
     }
+
+    fn set_outline(&mut self, outline: Outline) {
+        self.outline = outline;
+        self.vehicle.clear();
+        self.own.clear();
+        let wide = outline.grown_by(OWN_M);
+        for cell in 0..SIDE * SIDE {
+            let [x, y] = centre_m(cell);
+            if wide.contains(x, y) {
+                self.own.set(cell % SIDE, cell / SIDE);
+            }
+            if outline.contains(x, y) {
+                self.vehicle.push(cell);
+            }
+        }
+    }
+
+    /// Finds which cells are free, and what closes the others.
+    fn find(&mut self, sweep: &Sweep, context: &Context<'_>, reach: &Reach) {
+        let Self { low_things, drops, flood, barred, low, drop, free, stepped, released, own, .. } = self;
+        low.copy_from(low_things.find(reach));
+        low.remove(own);
+        match context.ground {
+            Some(ground) => drop.copy_from(drops.find(ground, reach, sweep.mount_height_m)),
+            None => drop.clear(),
+        }
+        drop.remove(own);
+        reach.flood_with([low, drop], barred, flood);
+        let covered = flood.covered();
+        free.copy_from(covered);
+        [reach.bits().closed, &*low, &*drop].into_iter().for_each(|closed| free.remove(closed));
+        free.remove(reach.outside());
+        reach.only_stepped(stepped);
+        [&*low, &*drop].into_iter().for_each(|closed| stepped.remove(closed));
+        released.clear();
+        releases::find(reach, stepped, covered, free, |ix, iy| released.set(ix, iy));
+        free.add(released);
+    }
 }
 
 impl LayerMaker for Freespace {
     fn layer(&self) -> Layer {
-        Layer::new("freespace", Self::geometry(), FreespaceClass::LEGEND, vec![TypedChannel::CLASS.empty()])
+        let mut channels = vec![TypedChannel::CLASS.empty()];
+        channels.extend(self.config.height.then(|| HEIGHT.empty()));
+        channels.extend(self.config.why.then(|| WHY.empty()));
+        Layer::new("freespace", Self::geometry(), FreespaceClass::LEGEND, channels)
     }
 
-    fn make(&mut self, _sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
-        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
-        match context.reach {
-            Some(reach) => write_classes(&reach.rows(), &mut class),
-            None => class.resize(SIDE * SIDE, FreespaceClass::Unknown.value()),
-        }
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         let outline = context.reach.map_or_else(|| ReachConfig::default().outline(), |reach| reach.config().outline());
-        let is_vehicle = |cell: &usize| {
-            let [x, y] = centre_m(*cell);
-            outline.contains(x, y)
-        };
-        (0..SIDE * SIDE).filter(is_vehicle).for_each(|cell| class[cell] = FreespaceClass::Vehicle.value());
+        if outline != self.outline {
+            self.set_outline(outline);
+        }
+        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
+        let mut height = self.config.height.then(|| HEIGHT.reuse(&mut layer.channels));
+        let mut why = self.config.why.then(|| WHY.reuse(&mut layer.channels));
+        match context.reach {
+            Some(reach) => {
+                self.find(sweep, context, reach);
+                let findings = Findings { reach, low: &self.low, drop: &self.drop, free: &self.free };
+                findings.write_classes(&mut class);
+                height.iter_mut().for_each(|height| findings.write_heights(context, height));
+                why.iter_mut().for_each(|why| findings.write_reasons(&class, why));
+            }
+            None => {
+                class.resize(SIDE * SIDE, FreespaceClass::Unknown.value());
+                height.iter_mut().for_each(|height| height.resize(SIDE * SIDE, HEIGHT.unknown));
+                why.iter_mut().for_each(|why| why.resize(SIDE * SIDE, WHY.unknown));
+            }
+        }
+        self.vehicle.iter().for_each(|cell| class[*cell] = FreespaceClass::Vehicle.value());
         layer.geometry = Self::geometry();
         layer.clear_lists();
         let free = count_cells(&class, FreespaceClass::Free.value());
         layer.metrics.push(("free_m2", free as f64 * f64::from(CELL_M * CELL_M)));
         TypedChannel::CLASS.store(&mut layer.channels, class);
+        height.into_iter().for_each(|height| HEIGHT.store(&mut layer.channels, height));
+        why.into_iter().for_each(|why| WHY.store(&mut layer.channels, why));
     }
-}
-
-/// Writes the class of each cell but those of the vehicle.
-fn write_classes(rows: &ReachRows<'_>, class: &mut Vec<u8>) {
-    let words = rows.reached.iter().zip(rows.closed).zip(rows.open).zip(rows.hidden);
-    class.extend(words.flat_map(|(((reached, closed), open), hidden)| {
-        (0..WORD).map(move |bit| {
-            let is = |word: &u64| word >> bit & 1 != 0;
-            let class = match () {
-                () if is(closed) => FreespaceClass::Occupied,
-                () if is(reached) => FreespaceClass::Free,
-                () if is(open) => FreespaceClass::NotReached,
-                () if is(hidden) => FreespaceClass::Hidden,
-                () => FreespaceClass::Unknown,
-            };
-            class.value()
-        })
-    }));
 }

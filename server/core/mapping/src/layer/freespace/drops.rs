@@ -1,0 +1,151 @@
+//! Drops: ditches, trenches and edges down, between two returns of one azimuth.
+//!
+//! In: the lowest return of each polar cell. Out: the cells between the last ground before a drop and the first return
+//! beyond it. The returns of an azimuth are taken in the order of their elevation, as the lasers of a sensor see them:
+//! in the order of their ranges the floor of a trench may lie beside its near edge. Ground goes on as the 2.5 m before
+//! it; a return that lies deeper than this line shows a drop. Two of three azimuths must agree. Under the first ring no
+//! ground lies before the drop: there the first return counts that lies deeper than the plane under the vehicle.
+//!
+//! From a height of 1.8 m a trench of 2 m shows its far side 0.5 m deep at 7 m, and 0.2 m at 15 m: one farther away, or
+//! a hole of less than 0.6 m, is not seen.
+
+use crate::ground::Ground;
+use crate::ground::polar::{COLUMNS, ROWS, Return, beside, column_directions, row_start_m};
+use crate::reach::Reach;
+use crate::reach::bits::Bits;
+use crate::reach::cells::{CELL_M, SIDE, centre_m};
+
+/// Greatest range of the ground before a drop, metres. Ours; see above.
+const RANGE_M_MAX: f32 = 13.0;
+/// Least and greatest distance between the two returns, metres. Ours: less is the noise of two returns, more a hill.
+const GAP_M: std::ops::Range<f32> = 0.3..8.0;
+/// Least depth under the line over the vehicle's clearance, metres, and least depth as a share of the distance. Ours:
+/// the noise of two returns; and a bend of 10 % is no drop.
+const DEPTH_OVER_M: f32 = 0.02;
+const DEPTH_SHARE_MIN: f32 = 0.1;
+/// Distance over which the slope before the drop is measured, metres, and its greatest slope.
+const BACK_M: f32 = 2.5;
+const SLOPE_MAX: f32 = 0.2;
+/// Heights over the estimate of the ground of returns that may be ground, metres: lower ones are mirror images.
+const GROUND_M: std::ops::Range<f32> = -1.6..0.25;
+/// Least depth of the first return under the plane under the vehicle, metres, and as a share of its range; its greatest
+/// range, metres. Ours: a bend of 10 % that begins at the vehicle is no drop.
+const FIRST_DEPTH_M_MIN: f32 = 0.3;
+const FIRST_SHARE_MIN: f32 = 0.06;
+const FIRST_M_MAX: f32 = 10.0;
+/// How far a drop reaches beyond its two returns, metres. Ours: half a cell, and a cell.
+const EDGES_M: [f32; 2] = [0.1, 0.25];
+/// Number of steps of a cell's side that are kept of a column: bits of a number.
+const STEPS: usize = 128;
+
+/// Finds the cells of drops. It reuses its buffers.
+#[derive(Clone)]
+pub struct Drops {
+    directions: [[f32; 2]; COLUMNS],
+    /// The returns of one column, the steepest first.
+    returns: Vec<Return>,
+    /// By column: one bit for each [`CELL_M`] of range, set in a drop.
+    spans: Vec<u128>,
+    found: Bits,
+}
+
+impl Drops {
+    /// No drops.
+    pub fn new() -> Self {
+        Self {
+            directions: column_directions(),
+            returns: Vec::new(),
+            spans: vec![0; COLUMNS],
+            found: Bits::square(SIDE),
+        }
+    }
+
+    /// Finds the drops of the newest map, seen from a sensor at this height over the ground, metres.
+    pub fn find(&mut self, ground: &Ground, reach: &Reach, sensor_m: f32) -> &Bits {
+        for column in 0..COLUMNS {
+            self.sort_returns(ground, column, sensor_m);
+            self.spans[column] = self.span(ground, column, sensor_m, reach.config().clearance_m + DEPTH_OVER_M);
+        }
+        self.mark(reach);
+        &self.found
+    }
+
+    fn sort_returns(&mut self, ground: &Ground, column: usize, sensor_m: f32) {
+        self.returns.clear();
+        let rows = (0..ROWS).take_while(|row| row_start_m(*row) < RANGE_M_MAX + GAP_M.end);
+        for cell in rows.map(|row| row * COLUMNS + column) {
+            let height_m = ground.surface_m(cell);
+            let of_ground = |found: &Return| GROUND_M.contains(&(found.z_m - height_m));
+            self.returns.extend(ground.cells().lowest(cell).find(of_ground));
+        }
+        let fall = |found: &Return| (sensor_m - found.z_m) / found.range_m;
+        self.returns.sort_by(|one, other| fall(other).total_cmp(&fall(one)));
+    }
+
+    /// The bits of a column's drops.
+    fn span(&self, ground: &Ground, column: usize, sensor_m: f32, depth_m_min: f32) -> u128 {
+        let mut span = 0;
+        if let Some(first) = self.returns.first().filter(|first| first.range_m < FIRST_M_MAX) {
+            let [cos, sin] = self.directions[column];
+            let plane_m = ground.near_plane().height_m(first.range_m * cos, first.range_m * sin);
+            let (depth_m, fall) = (plane_m - first.z_m, (sensor_m - first.z_m) / first.range_m);
+            if ground.near_plane().is_seen && depth_m > FIRST_DEPTH_M_MIN.max(FIRST_SHARE_MIN * first.range_m) {
+                // Without the drop the ray had met the plane here.
+                span |= bits((sensor_m - plane_m) / fall - EDGES_M[1], first.range_m + EDGES_M[1]);
+            }
+        }
+        for (at, pair) in self.returns.windows(2).enumerate() {
+            let [before, after] = [pair[0], pair[1]];
+            let gap_m = after.range_m - before.range_m;
+            if before.range_m >= RANGE_M_MAX || !GAP_M.contains(&gap_m) {
+                continue;
+            }
+            let line_m = before.z_m + self.slope(at) * gap_m;
+            if line_m - after.z_m > depth_m_min.max(DEPTH_SHARE_MIN * gap_m) {
+                span |= bits(before.range_m + EDGES_M[0], after.range_m + EDGES_M[1]);
+            }
+        }
+        span
+    }
+
+    /// Slope of the ground before a return of the column.
+    fn slope(&self, at: usize) -> f32 {
+        let Return { range_m, z_m } = self.returns[at];
+        let back = self.returns[..at].iter().rev().filter(|back| range_m - back.range_m >= BACK_M / 5.0);
+        let far = back.clone().find(|back| range_m - back.range_m >= BACK_M);
+        let slope = |back: &Return| (z_m - back.z_m) / (range_m - back.range_m);
+        far.or_else(|| back.last()).map_or(0.0, slope).clamp(-SLOPE_MAX, SLOPE_MAX)
+    }
+
+    fn mark(&mut self, reach: &Reach) {
+        self.found.clear();
+        if self.spans.iter().all(|span| *span == 0) {
+            return;
+        }
+        let agreed = |column: usize| {
+            let [left, own, right] = [-1, 0, 1].map(|offset| self.spans[beside(column, offset)]);
+            left & own | own & right | left & right
+        };
+        // The sides of a trench fill a part of their columns only.
+        let wide =
+            |column: usize| [-1, 0, 1].map(|offset| agreed(beside(column, offset))).into_iter().fold(0, |a, b| a | b);
+        let spans: Vec<u128> = (0..COLUMNS).map(wide).collect();
+        let half = ((RANGE_M_MAX + GAP_M.end) / CELL_M) as usize;
+        let near = SIDE / 2 - half..SIDE / 2 + half;
+        for (ix, iy) in near.clone().flat_map(|iy| near.clone().map(move |ix| (ix, iy))) {
+            let cell = iy * SIDE + ix;
+            let Some(polar) = reach.polar(cell).index() else { continue };
+            let span = spans[polar % COLUMNS];
+            let [x, y] = centre_m(cell);
+            if span != 0 && span >> ((x * x + y * y).sqrt() / CELL_M) as u32 & 1 != 0 {
+                self.found.set(ix, iy);
+            }
+        }
+    }
+}
+
+/// The bits from one range to another one.
+fn bits(from_m: f32, to_m: f32) -> u128 {
+    let [from, to] = [from_m, to_m].map(|metres| ((metres / CELL_M).max(0.0) as usize).min(STEPS - 1));
+    (u128::MAX >> (STEPS - 1 - to)) & (u128::MAX << from)
+}
