@@ -99,10 +99,15 @@ impl<T: CellType> TypedChannel<T> {
     /// Moves the memory of this channel's cells out of a layer, emptied, to be filled and given to
     /// [`TypedChannel::store`].
     pub fn reuse(&self, channels: &mut [Channel]) -> Vec<T> {
-        let channel = channels.iter_mut().find(|channel| channel.name == self.name);
-        let mut values = channel.map_or(Vec::new(), |channel| T::take_values(&mut channel.cells));
+        let mut values = self.reuse_values(channels);
         values.clear();
         values
+    }
+
+    /// Moves the cells of this channel out of a layer, to be changed and given to [`TypedChannel::store`].
+    pub(crate) fn reuse_values(&self, channels: &mut [Channel]) -> Vec<T> {
+        let channel = channels.iter_mut().find(|channel| channel.name == self.name);
+        channel.map_or(Vec::new(), |channel| T::take_values(&mut channel.cells))
     }
 
     /// Puts this channel with new raw values into a layer, in place of the one it had.

@@ -8,6 +8,7 @@
 //! | `grid` | where the cells lie |
 //! | [`radial_grid`] | r-θ grid: position -> cell |
 //! | [`roughness`] | deviations of the points -> roughness by cell, for `terrain` and `speed` |
+//! | `own_outline` | no cell in the vehicle's outline is occupied |
 //! | `registry` | the list of the seven; which of them are active |
 //! | [`freespace`] | where the whole vehicle can drive: the layer to plan on; not in the papers |
 //! | [`drivability`] | UT Austin thesis, section IV |
@@ -29,6 +30,7 @@ mod grid;
 pub mod height_difference;
 mod maker;
 pub mod occupancy;
+mod own_outline;
 pub mod radial_grid;
 pub mod radial_points;
 pub(crate) mod registry;

@@ -80,8 +80,12 @@ impl RadialGrid {
     /// Computes the rows again if the sensor of `sweep` differs from the last one.
     pub fn update_rows(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
         let Some(calibration) = &sweep.calibration else {
-            // The rings are not known, and no cell will be: one row to the largest range.
-            *self = Self::new(sweep.mount_m, vec![range_m_max], columns);
+            // The rings are not known: all rows have the same depth.
+            let is_same =
+                self.made_from.is_none() && self.azimuths.columns == columns && self.centre_m == sweep.mount_m;
+            if !is_same || self.row_radius_m.len() < 2 || self.row_radius_m.last() != Some(&range_m_max) {
+                *self = Self::new(sweep.mount_m, row_radii_m(&[], range_m_max), columns);
+            }
             return;
         };
         let height = sweep.mount_height_m;
@@ -118,6 +122,12 @@ impl RadialGrid {
         self.centre_m == [0.0; 2]
     }
 
+    /// Cosine and sine of the middle of one of so many columns.
+    pub(super) fn direction(column: usize, columns: usize) -> [f32; 2] {
+        let (sin, cos) = libm::sincosf((column as f32 + 0.5) / columns as f32 * std::f32::consts::TAU);
+        [cos, sin]
+    }
+
     /// Inner and outer radius of a row, metres.
     pub fn row_span_m(&self, row: usize) -> (f32, f32) {
         let inner = if row == 0 { 0.0 } else { self.row_radius_m[row - 1] };
@@ -143,13 +153,9 @@ impl RadialGrid {
     }
 
     /// Calls `visit(first_point, cells)` for each chunk of the sweep. A point beyond the last row falls into the row
-    /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. If the sweep's
-    /// rings are not known, there is no call. `azimuths` are those of the points about the ego origin in columns of two
+    /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. `azimuths` are those of the points about the ego origin in columns of two
     /// degrees, if they are known.
     pub fn for_each_chunk(&self, sweep: &Sweep, azimuths: Option<&[f32]>, mut visit: impl FnMut(usize, &[u32])) {
-        if sweep.calibration.is_none() {
-            return;
-        }
         let mut ranges_squared = [0.0f32; CHUNK];
         let mut cells = [0u32; CHUNK];
         let columns = self.columns() as u32;

@@ -47,7 +47,7 @@ impl RadialPoints {
     }
 
     /// By point of the sweep: its cell; that of a point beyond the last row is at least the number of cells, and less
-    /// than one row more. Empty if the sweep's rings are not known.
+    /// than one row more.
     pub fn cells(&self) -> &[u32] {
         &self.cell_of_point
     }

@@ -14,7 +14,8 @@ use crate::layer::height_difference::HeightDifference;
 use crate::layer::height_difference::config::HeightDifferenceConfig;
 use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::layer::occupancy::Occupancy;
-use crate::layer::occupancy::config::OccupancyConfig;
+use crate::layer::occupancy::config::{OccupancyConfig, OccupancyVariant};
+use crate::layer::own_outline;
 use crate::layer::radial_points::RadialPoints;
 use crate::layer::safe_path::SafePath;
 use crate::layer::safe_path::config::SafePathConfig;
@@ -80,6 +81,9 @@ macro_rules! layers {
                 maps.drivability.overhang_m = self.reach.overhang_m;
                 maps.terrain.overhang_m = self.reach.overhang_m;
                 maps.speed.overhang_m = self.reach.overhang_m;
+                if maps.occupancy.variant == OccupancyVariant::Polar {
+                    maps.occupancy.overhang_m = self.reach.overhang_m;
+                }
                 maps
             }
 
@@ -90,7 +94,8 @@ macro_rules! layers {
             pub fn validate(&self) -> Result<(), ConfigValueError> {
                 check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
                 self.reach.validate("vehicle.maps.reach")?;
-                $(self.$name.validate(concat!("vehicle.maps.", stringify!($name)))?;)+
+                let maps = self.with_one_overhang();
+                $(maps.$name.validate(concat!("vehicle.maps.", stringify!($name)))?;)+
                 Ok(())
             }
         }
@@ -238,6 +243,9 @@ impl Layers {
             let Some(Active { maker, spare }) = &mut layer.active else { continue };
             let mut made = spare.take().unwrap_or_else(|| maker.layer());
             maker.make(sweep, &Context { earlier: layers, radial: &self.radial, ..*context }, &mut made);
+            if let Some(reach) = context.reach {
+                own_outline::clear(&mut made, &reach.config().outline());
+            }
             layers.push(made);
             layer.made += 1;
         }

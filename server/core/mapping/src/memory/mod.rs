@@ -7,12 +7,14 @@
 //! - A cell remembers its lowest ground until a return shows it again, for `ground_s_max`.
 //! - An obstacle removes the ground of its cell. It is itself remembered for `obstacle_s_max`; then the cell is
 //!   unknown, so that a moving object leaves no trail, and ground under it is free only when it is seen again.
+//! - In a direction in which the newest map has no return nothing is remembered: the sensor may be covered there.
 //! - Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
 
 pub mod config;
 
 use nalgebra::{Isometry3, Point3};
 
+use crate::azimuth_columns::AzimuthColumns;
 use crate::sensor::sweep::Sweep;
 
 use config::{GROUND_S_MAX, MemoryConfig, OBSTACLE_S_MAX, RANGE_M_MAX};
@@ -30,6 +32,8 @@ const OBSTACLE_M: std::ops::RangeInclusive<f32> = 0.25..=2.5;
 const JUMP_M: [f64; 2] = [1.0, 60.0];
 const JUMP_RAD: [f64; 2] = [0.2, 3.0];
 const NS_PER_S: f64 = 1e9;
+/// Number of directions in which the map may have no return.
+const DIRECTIONS: usize = AzimuthColumns::TWO_DEGREES as usize;
 
 /// What one cell of the world holds.
 #[derive(Clone, Copy, Debug, Default)]
@@ -56,6 +60,7 @@ pub(crate) struct Memory {
     newest: Option<(Isometry3<f64>, i64)>,
     /// Points of the newest map and the remembered ones.
     extended: Sweep,
+    azimuths: AzimuthColumns,
     /// What the newest map got.
     state: MemoryState,
 }
@@ -77,6 +82,7 @@ impl Memory {
             listed: Vec::new(),
             newest: None,
             extended: Sweep::default(),
+            azimuths: AzimuthColumns::new(AzimuthColumns::TWO_DEGREES),
             state: MemoryState::default(),
         })
     }
@@ -169,6 +175,7 @@ impl Memory {
     fn recall(&mut self, map_from_ego: &Isometry3<f64>) {
         let ego_from_map = map_from_ego.inverse();
         let seen = self.seen_cells(map_from_ego);
+        let in_view = self.directions_in_view(&seen, &ego_from_map, map_from_ego);
         for &index in &self.listed {
             if seen[index as usize / 64] >> (index % 64) & 1 != 0 {
                 continue;
@@ -177,7 +184,8 @@ impl Memory {
             let [x, y] = cell.world.map(|world| (world as f64 + 0.5) * CELL_M);
             let z = if cell.obstacle_ns != 0 { cell.obstacle_m } else { cell.ground_m };
             let point = (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
-            if point.x * point.x + point.y * point.y <= RANGE_M_MAX * RANGE_M_MAX {
+            let is_near = point.x * point.x + point.y * point.y <= RANGE_M_MAX * RANGE_M_MAX;
+            if is_near && in_view[self.azimuths.column(point.x, point.y) as usize] {
                 self.extended.push_remembered([point.x, point.y, point.z]);
             }
         }
@@ -197,6 +205,37 @@ impl Memory {
             }
         }
         seen
+    }
+
+    /// By direction of two degrees: true if the map has a point there, or in a direction beside it, within the range of
+    /// the memory. In other directions the sensor may be covered, so that nothing is known there now.
+    fn directions_in_view(
+        &self,
+        seen: &[u64],
+        ego_from_map: &Isometry3<f64>,
+        map_from_ego: &Isometry3<f64>,
+    ) -> [bool; DIRECTIONS] {
+        let middle = map_from_ego.translation.vector;
+        let first = [middle.x, middle.y].map(|metres| (metres / CELL_M).floor() as i64 - SIDE / 2);
+        let mut in_view = [false; DIRECTIONS];
+        for (word, bits) in seen.iter().enumerate() {
+            let mut rest = *bits;
+            while rest != 0 {
+                let index = word as i64 * 64 + i64::from(rest.trailing_zeros());
+                rest &= rest - 1;
+                // The world's cell of this place that is in the square about the vehicle.
+                let stored = [index % SIDE, index / SIDE];
+                let [x, y] = [0, 1].map(|i| first[i] + (stored[i] - first[i]).rem_euclid(SIDE));
+                let [x, y] = [x, y].map(|cell| (cell as f64 + 0.5) * CELL_M);
+                let point = (ego_from_map * Point3::new(x, y, middle.z)).cast::<f32>();
+                let direction = self.azimuths.column(point.x, point.y) as usize;
+                [DIRECTIONS - 1, 0, 1]
+                    .map(|beside| (direction + beside) % DIRECTIONS)
+                    .into_iter()
+                    .for_each(|at| in_view[at] = true);
+            }
+        }
+        in_view
     }
 
     fn forget(&mut self) {
@@ -234,6 +273,13 @@ mod tests {
         Sweep { x, y, z: vec![z_m; 1600], ..Sweep::default() }
     }
 
+    /// One point in each direction, 20 m away.
+    fn view() -> Sweep {
+        let places = || (0..720).map(|i| libm::sincosf(i as f32 * std::f32::consts::TAU / 720.0));
+        let (y, x): (Vec<f32>, Vec<f32>) = places().map(|(sin, cos)| (20.0 * sin, 20.0 * cos)).unzip();
+        Sweep { z: vec![0.0; x.len()], x, y, ..Sweep::default() }
+    }
+
     /// Adds a map with these points over the ground z = 0, and returns how many points it gets from memory.
     fn map(memory: &mut Memory, sweep: &Sweep, seconds: f64) -> usize {
         memory.extend(sweep, Some(&Isometry3::identity()), at(seconds));
@@ -250,9 +296,29 @@ mod tests {
         let (mut memory, sweep) = (memory(), points(0.0));
         assert_eq!(map(&mut memory, &sweep, 0.0), 0);
         assert_eq!(map(&mut memory, &sweep, 0.1), 0, "the map sees all cells itself");
-        let half = Sweep { x: sweep.x[..800].into(), y: sweep.y[..800].into(), z: vec![0.0; 800], ..Sweep::default() };
+        let mut half = view();
+        half.x.extend_from_slice(&sweep.x[..800]);
+        half.y.extend_from_slice(&sweep.y[..800]);
+        half.z.resize(half.x.len(), 0.0);
         assert_eq!(map(&mut memory, &half, 0.2), 800);
-        assert_eq!(map(&mut memory, &Sweep::default(), 0.3), 1600);
+        assert_eq!(map(&mut memory, &view(), 0.3), 1600);
+    }
+
+    #[test]
+    fn nothing_is_recalled_in_a_direction_without_a_return() {
+        let mut memory = memory();
+        map(&mut memory, &points(0.0), 0.0);
+        let mut covered = view();
+        // Nothing is seen to the left.
+        let kept = |i: &usize| covered.y[*i] < 0.0;
+        let kept: Vec<usize> = (0..covered.x.len()).filter(kept).collect();
+        let pick = |axis: &[f32]| kept.iter().map(|i| axis[*i]).collect();
+        covered = Sweep { x: pick(&covered.x), y: pick(&covered.y), z: vec![0.0; kept.len()], ..Sweep::default() };
+        let own = covered.x.len();
+        let recalled = map(&mut memory, &covered, 0.1);
+        let places = memory.extended.x.iter().zip(&memory.extended.y).skip(own);
+        assert!(recalled >= 790, "{recalled}");
+        assert!(places.into_iter().all(|(x, y)| *y < 0.1 * x.abs() + 0.3), "a sector that is covered stays unknown");
     }
 
     #[test]
@@ -262,9 +328,9 @@ mod tests {
             let mut memory = memory();
             map(&mut memory, &points(heights_m[0]), 0.0);
             map(&mut memory, &points(heights_m[1]), 0.1);
-            assert_eq!(map(&mut memory, &Sweep::default(), 0.2), 1600, "{heights_m:?}");
-            assert_eq!(map(&mut memory, &Sweep::default(), forgotten_s), expected, "{heights_m:?}");
-            assert_eq!(map(&mut memory, &Sweep::default(), f64::from(GROUND_S_MAX) + 0.2), 0, "{heights_m:?}");
+            assert_eq!(map(&mut memory, &view(), 0.2), 1600, "{heights_m:?}");
+            assert_eq!(map(&mut memory, &view(), forgotten_s), expected, "{heights_m:?}");
+            assert_eq!(map(&mut memory, &view(), f64::from(GROUND_S_MAX) + 0.2), 0, "{heights_m:?}");
         }
     }
 }

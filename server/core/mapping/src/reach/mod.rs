@@ -33,6 +33,8 @@ mod shadow;
 mod steps;
 mod troughs;
 
+use std::ops::Range;
+
 use crate::ground::Ground;
 use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
 use crate::ground::surface::Confidence;
@@ -126,6 +128,8 @@ pub struct Reach {
     under_vehicle: Vec<usize>,
     obstacles: Obstacles,
     steps: Steps,
+    /// The cells with a return from the ground in the newest map itself, not in its memory.
+    seen_now: Bits,
     troughs: Troughs,
     shadow: Shadow,
     /// True by polar cell if an obstacle stands in it.
@@ -169,6 +173,7 @@ impl Reach {
             under_vehicle: centres_m.filter(|(_, [x, y])| outline.contains(*x, *y)).map(|(cell, _)| cell).collect(),
             obstacles: Obstacles::new(),
             steps: Steps::new(),
+            seen_now: bits.clone(),
             troughs: Troughs::new(),
             shadow: Shadow::new((0..SIDE * SIDE).map(cells::centre_m)),
             has_obstacle: vec![false; CELLS],
@@ -198,7 +203,12 @@ impl Reach {
 
     /// Finds closed cells and reached ground. `ground` is that of `sweep`.
     pub fn update(&mut self, sweep: &Sweep, ground: &Ground) {
-        self.sort_points(sweep, ground.heights_m());
+        let own = sweep.x.len() - sweep.remembered;
+        self.obstacles.clear();
+        self.steps.clear();
+        self.sort_points(sweep, ground.heights_m(), 0..own);
+        self.seen_now.copy_from(self.steps.seen());
+        self.sort_points(sweep, ground.heights_m(), own..sweep.x.len());
         self.closed.clear();
         let closed = &mut self.closed;
         let stepped = &mut self.stepped;
@@ -234,14 +244,13 @@ impl Reach {
     }
 
     /// Sorts the points into those of obstacles and those of the ground; the vehicle's own obstacles are left out.
-    fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32]) {
-        self.obstacles.clear();
-        self.steps.clear();
+    fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32], points: Range<usize>) {
         let ReachConfig { obstacle_m_min, overhang_m, .. } = self.config;
         let outline = self.config.outline();
         let mut cells = [cells::NOWHERE; CHUNK];
-        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
-        for (((xs, ys), zs), heights_m) in chunks.zip(heights_m.chunks(CHUNK)) {
+        let [xs, ys, zs, heights_m] =
+            [&sweep.x, &sweep.y, &sweep.z, heights_m].map(|axis| axis[points.clone()].chunks(CHUNK));
+        for (((xs, ys), zs), heights_m) in xs.zip(ys).zip(zs).zip(heights_m) {
             cells::find(xs, ys, &mut cells);
             for ((((&cell, &height), &x), &y), &z) in cells.iter().zip(heights_m).zip(xs).zip(ys).zip(zs) {
                 if cell == cells::NOWHERE {
@@ -281,7 +290,7 @@ impl Reach {
 
     /// The cells with a return from the ground in the newest map itself, not in its memory.
     pub(crate) fn seen_now(&self) -> &Bits {
-        self.steps.seen()
+        &self.seen_now
     }
 
     /// Closed cells and reached ground as bits.

@@ -50,7 +50,7 @@ pub struct SensorConfig {
     pub gps_late_days_max: f64,
     /// Elevation of each laser, degrees; for a sensor that sends scans. They come before those of the model. Without
     /// either, the elevations are measured from the rings of the first scan; if that has no rings, from the order and
-    /// the elevations of its points; if these show no lasers, radial maps whose rows this sensor defines are unknown.
+    /// the elevations of its points; if these show no lasers, the rows of radial maps that this sensor defines have the same depth.
     #[serde(default)]
     pub elevations_deg: Vec<f32>,
     /// Standard deviation of the sensor's range noise, metres; the roughness of the ground is measured without it.

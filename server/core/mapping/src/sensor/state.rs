@@ -93,7 +93,7 @@ pub enum ElevationSource {
     Rings,
     /// The points of a scan that states no rings.
     Estimated,
-    /// None: a scan states no rings and does not show them. Radial maps whose rows the sensor defines are unknown.
+    /// None: a scan states no rings and does not show them. The rows of radial maps that the sensor defines have the same depth.
     Unknown,
 }
 
@@ -127,7 +127,7 @@ impl ElevationSource {
                  `model` or `elevations_deg`",
             ),
             Self::Unknown => Some(
-                "the scans state no rings and do not show them, so radial maps have no rows and are unknown: send \
+                "the scans state no rings and do not show them, so the rows of radial maps are 1 m deep: send \
                  rings, or set `model` or `elevations_deg`",
             ),
         }

@@ -53,9 +53,11 @@ pub struct Sweep {
     pub deviation: Vec<Deviation>,
     /// Number of returns before the vehicle's own were removed.
     pub returns: u32,
-    /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all cells of
-    /// radial maps are unknown.
+    /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all
+    /// rows have the same depth.
     pub calibration: Option<Arc<Calibration>>,
+    /// Number of points at the end that no sensor has measured in this sweep: those of its memory.
+    pub remembered: usize,
     /// Height of the sensor over the ground, metres.
     pub mount_height_m: f32,
     /// Position (x, y) of the sensor, ego frame, metres: the centre of radial maps.
@@ -274,7 +276,7 @@ impl Sweep {
         }
         self.deviation.clone_from(&other.deviation);
         self.calibration.clone_from(&other.calibration);
-        self.returns = other.returns;
+        (self.returns, self.remembered) = (other.returns, other.remembered);
         self.copy_mount(other);
     }
 
@@ -308,6 +310,7 @@ impl Sweep {
         self.x.push(x);
         self.y.push(y);
         self.z.push(z);
+        self.remembered += 1;
     }
 
     /// Copies what defines the rows of radial maps: the elevations and the position of the sensor.

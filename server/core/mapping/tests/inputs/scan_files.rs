@@ -136,7 +136,7 @@ fn a_map_names_the_source_of_the_elevations() {
     let cases = [
         ("rings", sensor(), None, ringed, Rings, 16),
         ("order", sensor(), None, ground(), Estimated, 16),
-        ("no order", sensor(), None, shuffled(&ground()), Unknown, 1),
+        ("no order", sensor(), None, shuffled(&ground()), Unknown, 60),
         ("elevations", SensorConfig { elevations_deg, ..sensor() }, None, ground(), Configured, 3),
         ("model", with_model.clone(), None, ground(), Model, 22),
         ("both", both.clone(), None, ground(), Configured, 3),
@@ -148,8 +148,7 @@ fn a_map_names_the_source_of_the_elevations() {
         assert_eq!(pipeline.sensors()[0].elevations, Some(expected), "{name}");
         let found = common::benches(&map.layers[0]).len();
         assert!(found.abs_diff(rows) <= rows / 5, "{name}: {found} rows");
-        let is_known = common::classes(&map.layers[0]).iter().any(|class| *class != 0);
-        assert_eq!(is_known, expected != Unknown, "{name}");
+        assert!(common::classes(&map.layers[0]).iter().any(|class| *class != 0), "{name}");
         assert_eq!(expected.advice().is_some(), matches!(expected, Estimated | Unknown), "{name}");
     }
 }

@@ -2,6 +2,7 @@
 
 mod contract;
 mod criteria;
+mod freespace;
 mod occupancy;
 mod properties;
 mod safe_path;

@@ -118,12 +118,12 @@ fn wider_columns_and_the_criteria_of_the_thesis_stay_useful() {
         passage: Passage::BetweenSegments,
         ..own.clone()
     };
-    // The thesis whole starts at cell (0, 0), which has no point in this frame: no segment grows.
+    // The thesis whole starts at cell (0, 0), under the vehicle.
     let paper = DrivabilityConfig { variant: DrivabilityVariant::Paper, ..own.clone() };
     let mut map = Drivability::new(&paper);
     let mut layer = map.layer();
     map.make(&labelled_frame().0, &Context::default(), &mut layer);
-    assert_eq!(figure(&layer, "drivable_share"), 0.0);
+    assert!(figure(&layer, "drivable_share") > 0.3, "{}", figure(&layer, "drivable_share"));
     let configs = [
         (DrivabilityConfig { columns: 180, ..own.clone() }, Over::Ground),
         (DrivabilityConfig { columns: 90, ..own.clone() }, Over::Ground),

@@ -59,6 +59,19 @@ impl Heights {
         }
     }
 
+    /// Makes the empty cells of the innermost row level ground, as under the vehicle: the thesis takes the vehicle's own
+    /// cell as the start, and no return falls into it.
+    pub fn fill_own_row(&mut self, columns: usize, config: &DrivabilityConfig) {
+        for unit in self.units.iter_mut().take(columns).filter(|unit| **unit == UNIT_HEIGHT_UNKNOWN) {
+            *unit = unit_height(0.0, config);
+        }
+    }
+
+    /// True if a return fell into the cell.
+    pub fn is_seen(&self, cell: usize) -> bool {
+        self.highest[cell].point != EMPTY.point
+    }
+
     /// Unit height of each cell; [`UNIT_HEIGHT_UNKNOWN`] if the cell is empty.
     pub fn units(&self) -> &[i8] {
         &self.units

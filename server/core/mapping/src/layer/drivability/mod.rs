@@ -67,8 +67,10 @@ impl Drivability {
         let mut unit_height = self.unit_height().reuse(&mut layer.channels);
         let mut segment = SEGMENT.reuse(&mut layer.channels);
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
-        unit_height.extend_from_slice(self.heights.units());
-        segment.extend_from_slice(self.segments.of_cell());
+        let units = self.heights.units().iter().copied().enumerate();
+        unit_height.extend(units.map(|(cell, of)| if self.heights.is_seen(cell) { of } else { UNIT_HEIGHT_UNKNOWN }));
+        let segments = self.segments.of_cell().iter().copied().enumerate();
+        segment.extend(segments.map(|(cell, of)| if self.heights.is_seen(cell) { of } else { SEGMENT.unknown }));
         class.extend(segment.iter().enumerate().map(|(cell, &segment)| self.class(cell, segment, context).value()));
         layer.planes.extend_from_slice(self.ego_planes.of_segment());
         layer.metrics.push(("drivable_share", drivable_share(layer.legend, &class)));
@@ -125,6 +127,9 @@ impl LayerMaker for Drivability {
         let grid = points.grid();
         grid.write_geometry(&mut layer.geometry);
         self.heights.compute(points, sweep, context, &self.config);
+        if self.config.variant == DrivabilityVariant::Paper {
+            self.heights.fill_own_row(grid.columns(), &self.config);
+        }
         self.segments.grow(grid, &self.heights, &self.config);
         let points = self.heights.points().iter().copied();
         self.planes.fit(points.clone(), &self.segments);

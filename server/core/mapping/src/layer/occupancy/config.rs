@@ -25,7 +25,7 @@ pub(super) const HITS_SLOW: u8 = 20;
 /// Number of returns at high speed, and if the speed is not known. 2: Seo 2014, figure 5.
 pub(super) const HITS_FAST: u8 = 2;
 
-/// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
+/// With `variant = "polar"`: number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
 /// that no sensor sees again leaves the third map; not tuned.
 pub(super) const HOLD_MAPS: u8 = 2;
 
@@ -52,7 +52,8 @@ pub struct OccupancyConfig {
     /// Least height of an obstacle over the ground, metres; the vehicle drives over lower ones. 0.3 is ours, because
     /// the paper says "ego-vehicle's clearance" without a number; not tuned.
     pub clearance_m: f32,
-    /// Least height of a return that is not counted, metres; the vehicle passes under it. 5: Seo 2014, section 2.
+    /// With `variant = "paper"`: least height of a return that is not counted, metres; the vehicle passes under it. 5: Seo
+    /// 2014, section 2. The other variant has the overhang of [`crate::reach`].
     pub overhang_m: f32,
     /// Reliable range of the sensors, metres; cells beyond it are out of range. 150: Seo 2014, section 2.
     pub range_m_max: f32,
@@ -102,6 +103,19 @@ impl Default for OccupancyConfig {
 }
 
 impl OccupancyConfig {
+    /// The parameters with the values of the variant: the paper counts hits, and keeps nothing that no return confirms.
+    pub(crate) fn of_variant(&self) -> Self {
+        match self.variant {
+            OccupancyVariant::Polar => self.clone(),
+            OccupancyVariant::Paper => Self { hits: Hits::Counted, ..self.clone() },
+        }
+    }
+
+    /// With `variant = "polar"`: number of maps for which an occupied cell without new evidence stays occupied.
+    pub(crate) fn hold_maps(&self) -> u8 {
+        if self.variant == OccupancyVariant::Paper { 0 } else { HOLD_MAPS }
+    }
+
     /// Checks the values of the table `at`, and how they fit one another.
     ///
     /// # Errors

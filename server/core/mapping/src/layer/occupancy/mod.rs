@@ -49,9 +49,7 @@ use crate::sensor::rays::{Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
 use class::{HITS, OccupancyClass};
-use config::{
-    CALM_MAPS, HITS_FAST, HITS_SLOW, HOLD_MAPS, OccupancyConfig, OccupancyVariant, SPEED_MPS_FAST, SPEED_MPS_SLOW,
-};
+use config::{CALM_MAPS, HITS_FAST, HITS_SLOW, OccupancyConfig, OccupancyVariant, SPEED_MPS_FAST, SPEED_MPS_SLOW};
 use flicker::Flicker;
 use lines::Lines;
 use polar_scan::PolarScans;
@@ -98,7 +96,7 @@ impl Occupancy {
         // Largest distance from a sensor within half the grid's extent to a corner of the grid.
         let reach_m = 1.5 * std::f32::consts::SQRT_2 * config.extent_m;
         Self {
-            config: config.clone(),
+            config: config.of_variant(),
             window: Window::new(side, f64::from(config.cell_m)),
             scans: match config.variant {
                 OccupancyVariant::Polar => {
@@ -147,7 +145,7 @@ impl Occupancy {
             Scans::Polar(scans) => scans.write_evidence(&self.config, earliest_ns, &self.window, &mut class),
             Scans::Paper(lines) => lines.write_evidence(earliest_ns, &self.window, &mut class),
         };
-        let limits = [needed, HOLD_MAPS];
+        let limits = [needed, self.config.hold_maps()];
         self.window.update_states(limits, any, self.config.hits, &mut class, &mut hits);
         if self.window.anchored() && self.config.variant == OccupancyVariant::Polar {
             self.flicker.calm(self.window.corner(), &mut class);

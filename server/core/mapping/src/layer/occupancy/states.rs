@@ -109,7 +109,8 @@ impl Cell {
         } else if rays == Evidence::Through {
             // The cell is no longer occupied at once, so that no object leaves a trail. The hits fade step by step, so
             // that a thin object that rays sometimes miss does not become clear.
-            hits = (hits >> 2).min(hits_needed - 1);
+            // Without a hold nothing of earlier maps counts.
+            hits = if hold_maps > 0 { (hits >> 2).min(hits_needed - 1) } else { 0 };
             evidence = if hits > 0 { Evidence::ThroughDoubted } else { Evidence::Through };
         }
         let age = if fresh > 0 || rays == Evidence::Through { 0 } else { self.age.saturating_add(1) };

@@ -1,0 +1,158 @@
+//! The layer `freespace`: what is never free, and what is found.
+
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{FreespaceConfig, ReachConfig};
+use clearway_mapping::layer::freespace::Freespace;
+use clearway_mapping::layer::freespace::class::FreespaceClass;
+use clearway_mapping::layer::{Layer, LayerMaker, Meaning};
+use clearway_mapping::sensor::sweep::Sweep;
+use proptest::prelude::*;
+
+use crate::common::*;
+
+fn freespace(sweep: &Sweep) -> Layer {
+    let mut maker = Freespace::new(&FreespaceConfig { height: true, why: true, ..FreespaceConfig::default() });
+    let mut layer = maker.layer();
+    maker.make(sweep, &shared(sweep).context(), &mut layer);
+    layer
+}
+
+/// Centre of a cell, ego frame, metres.
+fn centre(cell: usize) -> [f32; 2] {
+    [cell % 512, cell / 512].map(|index| (index as f32 + 0.5) * 0.25 - 64.0)
+}
+
+fn is_own(cell: usize) -> bool {
+    let [x, y] = centre(cell);
+    ReachConfig::default().outline().contains(x, y)
+}
+
+fn is_free(layer: &Layer, cell: usize) -> bool {
+    layer.legend[usize::from(classes(layer)[cell])].meaning == Meaning::Free
+}
+
+/// The cells of a class whose centres are in a rectangle of the ego frame.
+fn count(layer: &Layer, class: FreespaceClass, x_m: [f32; 2], y_m: [f32; 2]) -> usize {
+    let is_inside = |cell: &usize| {
+        let [x, y] = centre(*cell);
+        (x_m[0]..x_m[1]).contains(&x) && (y_m[0]..y_m[1]).contains(&y)
+    };
+    (0..classes(layer).len()).filter(is_inside).filter(|cell| classes(layer)[*cell] == class.value()).count()
+}
+
+#[test]
+fn without_points_all_but_the_vehicle_is_unknown() {
+    let layer = freespace(&empty(Model::Hdl64eS2));
+    for (cell, class) in classes(&layer).iter().enumerate() {
+        let expected = if is_own(cell) { FreespaceClass::Vehicle } else { FreespaceClass::Unknown };
+        assert_eq!(*class, expected.value(), "{:?}", centre(cell));
+    }
+}
+
+#[test]
+fn every_cell_of_open_level_ground_is_free_whether_a_return_fell_into_it_or_not() {
+    for (model, to_m) in [(Model::Hdl64eS2, 30.0), (Model::Hdl32e, 20.0), (Model::Vlp16, 15.0)] {
+        let layer = freespace(&cast(model, plain));
+        let is_near = |cell: &usize| libm::hypotf(centre(*cell)[0], centre(*cell)[1]) < to_m;
+        let (mut cells, mut bridged) = (0, 0);
+        for cell in (0..classes(&layer).len()).filter(is_near) {
+            assert!(is_free(&layer, cell), "{model:?} {:?}: {}", centre(cell), class_name(&layer, cell));
+            (cells, bridged) = (cells + 1, bridged + usize::from(values(&layer, "why")[cell] == 2));
+            if cells > 200 {
+                break;
+            }
+        }
+        assert!(bridged < cells);
+    }
+}
+
+#[test]
+fn a_wall_is_occupied_and_nothing_behind_it_is_free() {
+    let layer = freespace(&cast(Model::Hdl64eS2, court));
+    assert!(count(&layer, FreespaceClass::Occupied, [14.7, 15.3], [-7.0, 7.0]) >= 50);
+    assert_eq!(count(&layer, FreespaceClass::Free, [15.3, 60.0], [-20.0, 20.0]), 0);
+    assert!(count(&layer, FreespaceClass::Free, [4.0, 14.0], [-7.0, 7.0]) >= 2_000);
+}
+
+#[test]
+fn a_log_is_low_and_a_trench_is_a_drop() {
+    for (at_m, across_m) in [(7.0, 0.0), (10.0, 0.0), (9.0, 4.0)] {
+        let log = |x: f32, y: f32, z: f32| {
+            let is_in = (at_m..at_m + 0.3).contains(&x) && (across_m - 1.0..across_m + 1.0).contains(&y);
+            z <= if is_in { 0.2 } else { 0.0 }
+        };
+        let layer = freespace(&cast(Model::Hdl64eS2, log));
+        let (x_m, y_m) = ([at_m, at_m + 0.25], [across_m - 0.9, across_m + 0.9]);
+        assert_eq!(count(&layer, FreespaceClass::Free, x_m, y_m), 0, "{at_m} {across_m}");
+        assert!(count(&layer, FreespaceClass::Low, x_m, y_m) >= 6, "{at_m} {across_m}");
+    }
+    for at_m in [6.5, 9.0] {
+        let trench = |x: f32, y: f32, z: f32| {
+            let is_in = (at_m..at_m + 2.0).contains(&x) && y.abs() < 3.0;
+            z <= if is_in { -1.0 } else { 0.0 }
+        };
+        let layer = freespace(&cast(Model::Hdl64eS2, trench));
+        let (x_m, y_m) = ([at_m + 0.1, at_m + 1.9], [-2.5, 2.5]);
+        assert_eq!(count(&layer, FreespaceClass::Free, x_m, y_m), 0, "{at_m}");
+        assert!(count(&layer, FreespaceClass::Drop, x_m, y_m) >= 100, "{at_m}");
+    }
+}
+
+#[test]
+fn the_sector_of_a_covered_sensor_is_never_free() {
+    for middle in [0.0_f32, 1.0, 2.0, 3.0] {
+        let whole = cast(Model::Hdl64eS2, plain);
+        let off = |x: f32, y: f32| (libm::atan2f(y, x) - middle + 9.424_778) % 6.283_185 - 3.141_593;
+        let mut sweep = empty(Model::Hdl64eS2);
+        for ((x, y), z) in whole.x.iter().zip(&whole.y).zip(&whole.z) {
+            if off(*x, *y).abs() > 0.5 {
+                add(&mut sweep, [*x, *y, *z]);
+            }
+        }
+        let layer = freespace(&sweep);
+        for cell in (0..classes(&layer).len()).filter(|cell| is_free(&layer, *cell) && !is_own(*cell)) {
+            let [x, y] = centre(cell);
+            let range_m = libm::hypotf(x, y);
+            // The directions of the ground's estimate are two degrees wide; the blind zone has none.
+            let is_inside = off(x, y).abs() < 0.5 - 0.07 && (0.5 - off(x, y).abs()) * range_m > 0.8;
+            assert!(!is_inside || range_m < 3.0, "{middle}: {x} {y}");
+        }
+    }
+}
+
+#[test]
+fn the_order_of_the_points_and_used_buffers_have_no_effect() {
+    let sweep = cast(Model::Hdl64eS2, court);
+    let layer = freespace(&sweep);
+    let mut maker = Freespace::new(&FreespaceConfig { height: true, why: true, ..FreespaceConfig::default() });
+    let mut used = maker.layer();
+    maker.make(&cast(Model::Vlp16, plain), &shared(&sweep).context(), &mut used);
+    let other = shuffled(&sweep, 3);
+    maker.make(&other, &shared(&other).context(), &mut used);
+    assert_eq!(used, layer);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn a_cell_with_an_obstacle_is_never_free_and_the_outline_is_the_vehicle(
+        points in prop::collection::vec((-30f32..30.0, -30f32..30.0, 0.0f32..3.0), 0..60),
+    ) {
+        let mut sweep = cast(Model::Vlp16, plain);
+        points.iter().for_each(|(x, y, z)| add(&mut sweep, [*x, *y, *z]));
+        let shared = shared(&sweep);
+        let layer = freespace(&sweep);
+        let config = ReachConfig::default();
+        let heights_m = shared.context().heights_m(&sweep).to_vec();
+        for (point, height_m) in heights_m.iter().enumerate() {
+            let Some(cell) = cell_at(&layer, sweep.x[point], sweep.y[point]) else { continue };
+            if (config.obstacle_m_min..=config.overhang_m).contains(height_m) && !is_own(cell) {
+                prop_assert!(!is_free(&layer, cell), "{} {}: {height_m}", sweep.x[point], sweep.y[point]);
+            }
+        }
+        for cell in (0..classes(&layer).len()).filter(|cell| is_own(*cell)) {
+            prop_assert_eq!(classes(&layer)[cell], FreespaceClass::Vehicle.value());
+        }
+    }
+}
