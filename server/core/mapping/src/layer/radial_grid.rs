@@ -122,6 +122,11 @@ impl RadialGrid {
         self.centre_m == [0.0; 2]
     }
 
+    /// Position (x, y) of the centre, ego frame, metres.
+    pub(super) fn centre_m(&self) -> [f32; 2] {
+        self.centre_m
+    }
+
     /// Cosine and sine of the middle of one of so many columns.
     pub(super) fn direction(column: usize, columns: usize) -> [f32; 2] {
         let (sin, cos) = libm::sincosf((column as f32 + 0.5) / columns as f32 * std::f32::consts::TAU);

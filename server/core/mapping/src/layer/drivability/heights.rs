@@ -4,11 +4,12 @@
 //! under the overhang cut-off, and `unit_height = floor((height + offset) / unit)`.
 
 use crate::layer::maker::Context;
+use crate::layer::radial_grid::RadialGrid;
 use crate::layer::radial_points::RadialPoints;
 use crate::sensor::sweep::Sweep;
 
 use super::class::UNIT_HEIGHT_UNKNOWN;
-use super::config::{DrivabilityConfig, UNIT_HEIGHT_M};
+use super::config::{BLIND_ZONE_M, DrivabilityConfig, UNIT_HEIGHT_M};
 
 /// Highest point of a cell so far: its height over the ground and its index in the sweep.
 #[derive(Clone, Copy, Debug)]
@@ -59,11 +60,20 @@ impl Heights {
         }
     }
 
-    /// Makes the empty cells of the innermost row level ground, as under the vehicle: the thesis takes the vehicle's own
-    /// cell as the start, and no return falls into it.
-    pub fn fill_own_row(&mut self, columns: usize, config: &DrivabilityConfig) {
-        for unit in self.units.iter_mut().take(columns).filter(|unit| **unit == UNIT_HEIGHT_UNKNOWN) {
-            *unit = unit_height(0.0, config);
+    /// Makes the empty cells before the first return of each column level ground, as under the vehicle: the thesis takes
+    /// the vehicle's own cell as the start, and no return falls near it.
+    pub fn fill_blind_zone(&mut self, grid: &RadialGrid, config: &DrivabilityConfig) {
+        let [x, y] = grid.centre_m();
+        for column in 0..grid.columns() {
+            let [cos, sin] = RadialGrid::direction(column, grid.columns());
+            let rows = (0..grid.rows()).take_while(|row| grid.row_span_m(*row).0 < BLIND_ZONE_M);
+            let empty =
+                rows.map(|row| (row, row * grid.columns() + column)).take_while(|(_, cell)| !self.is_seen(*cell));
+            for (row, cell) in empty.collect::<Vec<_>>() {
+                let radius_m = grid.row_span_m(row).1;
+                self.units[cell] = unit_height(0.0, config);
+                self.points[cell] = [x + radius_m * cos, y + radius_m * sin, 0.0];
+            }
         }
     }
 

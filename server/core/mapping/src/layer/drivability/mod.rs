@@ -128,7 +128,7 @@ impl LayerMaker for Drivability {
         grid.write_geometry(&mut layer.geometry);
         self.heights.compute(points, sweep, context, &self.config);
         if self.config.variant == DrivabilityVariant::Paper {
-            self.heights.fill_own_row(grid.columns(), &self.config);
+            self.heights.fill_blind_zone(grid, &self.config);
         }
         self.segments.grow(grid, &self.heights, &self.config);
         let points = self.heights.points().iter().copied();
