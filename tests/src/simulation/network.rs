@@ -1,6 +1,7 @@
 //! The networks between the car's sensors and the server: what the sensors send, with their faults, until it arrives.
 
 use bytes::Bytes;
+use clearway_daemon::ingest::queue::{Arrival, LiveReading};
 use clearway_daemon::ingest::udp::DATAGRAM_BYTES_MAX;
 use clearway_mapping::event::{Body, Cause};
 use clearway_sim::vehicle::Datagram;
@@ -126,7 +127,9 @@ impl TestBed<'_> {
                 continue;
             }
             assert!(payload.len() <= DATAGRAM_BYTES_MAX, "the network does not lengthen datagrams");
-            self.queue.push(source, Body::Datagram(Bytes::from(payload))).expect("the engine is there");
+            self.queue
+                .push([LiveReading::new(Arrival::Now, source, Body::Datagram(Bytes::from(payload)))])
+                .expect("the engine is there");
         }
         self.set_clock(self.now_ns);
     }

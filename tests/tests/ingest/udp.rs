@@ -7,7 +7,7 @@ use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 
 use clearway_daemon::config::{Config, Sender, Udp};
-use clearway_daemon::ingest::queue::event_queue;
+use clearway_daemon::ingest::queue::{Arrival, LiveReading, event_queue};
 use clearway_daemon::record::{run_config, verify};
 use clearway_daemon::replay::{ReplayOptions, replay};
 use clearway_daemon::run::Running;
@@ -209,6 +209,7 @@ fn a_million_datagrams_add_up_exactly() {
     broken[0] = 0;
     let kinds = [position, broken, Vec::new(), vec![0; 1205], vec![0; 1536]].map(bytes::Bytes::from);
     let packets: Vec<_> = packets.into_iter().map(bytes::Bytes::from).collect();
+    let reading = |packet: &bytes::Bytes| LiveReading::new(Arrival::Now, 0, Body::Datagram(packet.clone()));
     let total = 1_000_000;
     let (mut sent, mut dropped, mut next) = (0_u64, [0_u64; 3], 0);
     while sent < total {
@@ -229,14 +230,14 @@ fn a_million_datagrams_add_up_exactly() {
                     queue.record_drop(0, Cause::Kernel, 1);
                     dropped[2] += 1;
                 }
-                kind @ 3..8 => readings.push((0, Body::Datagram(kinds[kind as usize - 3].clone()))),
+                kind @ 3..8 => readings.push(reading(&kinds[kind as usize - 3])),
                 _ => {
-                    readings.push((0, Body::Datagram(packets[next % packets.len()].clone())));
+                    readings.push(reading(&packets[next % packets.len()]));
                     next += 1;
                 }
             }
         }
-        queue.push_batch(readings).unwrap();
+        queue.push(readings).unwrap();
         // The engine stalls now and then.
         if random.next_u32().is_multiple_of(8) {
             events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));

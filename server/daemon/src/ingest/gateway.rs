@@ -14,7 +14,7 @@ use tokio::sync::watch;
 
 use super::admission::{Admission, AdmissionPermit, OpenStream, StreamLimitError, StreamLimits};
 use super::observation::{self, Limits, ObservationError};
-use super::queue::EventQueue;
+use super::queue::{Arrival, EventQueue, LiveReading};
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, Receipt};
 use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::base::sync::locked;
@@ -184,7 +184,8 @@ impl Gateway {
 
     /// Returns true if the event is on the queue; otherwise the receipt delivers the refusal.
     fn push_event(&self, captured_ns: Option<i64>, source: u16, body: Body, receipt: Receipt) -> bool {
-        self.queue.push_observation(captured_ns, source, body, receipt).unwrap_or(false)
+        let arrival = captured_ns.map_or(Arrival::Now, Arrival::Captured);
+        self.queue.push([LiveReading { arrival, source, body, receipt: Some(receipt) }]).unwrap_or(false)
     }
 
     /// Ends a client: the sensors that it alone has declared are withdrawn.

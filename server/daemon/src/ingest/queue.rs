@@ -40,6 +40,38 @@ pub struct Reading {
     pub body: Body,
 }
 
+/// When a live reading arrived.
+#[derive(Clone, Copy, Debug)]
+pub enum Arrival {
+    /// At the present, by the queue's clock.
+    Now,
+    /// A datagram, when the kernel received it, in ns since the Unix epoch. A time that is not plausible by the queue's
+    /// clock, or unknown, is replaced by the present. The datagram takes space of its sensor's share of the queue.
+    Received(Option<i64>),
+    /// At the stamp of its capture, in ns since the Unix epoch.
+    Captured(i64),
+}
+
+/// A reading that cannot be made to wait.
+#[derive(Debug)]
+pub struct LiveReading {
+    /// When it arrived.
+    pub arrival: Arrival,
+    /// Index of the sensor in the vehicle's configuration.
+    pub source: u16,
+    /// The content.
+    pub body: Body,
+    /// Delivers the outcome to the client that sent it.
+    pub receipt: Option<Receipt>,
+}
+
+impl LiveReading {
+    /// A reading without a client.
+    pub fn new(arrival: Arrival, source: u16, body: Body) -> Self {
+        Self { arrival, source, body, receipt: None }
+    }
+}
+
 /// The queue accepts no more events, because the engine has stopped or the queue is closed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the vehicle's engine has stopped")]
@@ -159,14 +191,6 @@ impl EventQueue {
         self.clock.now_ns()
     }
 
-    /// Pushes a live reading, stamped now. Never waits: if the queue is full, the reading is counted as lost.
-    ///
-    /// # Errors
-    /// [`QueueClosedError`] if the engine has stopped.
-    pub fn push(&self, source: u16, body: Body) -> Result<(), QueueClosedError> {
-        self.push_batch([(source, body)])
-    }
-
     /// Pushes an event that is no reading, if the queue has space. Its stamp is that of the newest event, so that the
     /// time of a captured drive does not jump. Never waits, and counts nothing: the caller tries again. True if the
     /// event is on the queue.
@@ -177,66 +201,36 @@ impl EventQueue {
         state.push(place.into(), Reading { arrival_ns, source, body }, None).is_ok()
     }
 
-    /// Pushes live readings that arrived together, all with the same stamp. Never waits, as [`EventQueue::push`].
+    /// Pushes live readings that arrived together. Never waits: if the queue, or the sensor's share of it, is full, a
+    /// reading is counted as lost and its receipt delivers the refusal. Returns true if the queue had space for all.
     ///
     /// # Errors
-    /// [`QueueClosedError`] if the engine has stopped.
-    pub fn push_batch(&self, readings: impl IntoIterator<Item = (u16, Body)>) -> Result<(), QueueClosedError> {
-        self.push_all(None, readings.into_iter().map(|(source, body)| (source, None, body, None)), None).map(drop)
-    }
-
-    /// Pushes datagrams of sensors with the times at which the kernel received them. A time that is not plausible by
-    /// the queue's clock, or unknown, is replaced by the present. Never waits, as [`EventQueue::push`]. Each sensor has
-    /// its share of the queue; what is more is counted as lost, and leaves the space of the others.
-    ///
-    /// # Errors
-    /// [`QueueClosedError`] if the engine has stopped.
-    pub fn push_received(
-        &self,
-        readings: impl IntoIterator<Item = (u16, Option<i64>, Body)>,
-    ) -> Result<(), QueueClosedError> {
-        let readings = readings.into_iter().map(|(source, received_ns, body)| (source, received_ns, body, None));
-        self.push_all(None, readings, self.shares.as_deref()).map(drop)
-    }
-
-    /// Pushes an observation, stamped `captured_ns` or now. Never waits. Returns true if the event is on the queue;
-    /// otherwise the receipt has delivered the refusal.
-    ///
-    /// # Errors
-    /// [`QueueClosedError`] if the engine has stopped; the receipt delivers that too.
-    pub fn push_observation(
-        &self,
-        captured_ns: Option<i64>,
-        source: u16,
-        body: Body,
-        receipt: Receipt,
-    ) -> Result<bool, QueueClosedError> {
-        self.push_all(captured_ns, [(source, captured_ns, body, Some(receipt))], None)
-    }
-
-    /// Returns true if all readings are on the queue. With `shares`, each takes space of its sensor's share.
-    fn push_all(
-        &self,
-        captured_ns: Option<i64>,
-        readings: impl IntoIterator<Item = (u16, Option<i64>, Body, Option<Receipt>)>,
-        shares: Option<&Shares>,
-    ) -> Result<bool, QueueClosedError> {
+    /// [`QueueClosedError`] if the engine has stopped; the receipts deliver that too.
+    pub fn push(&self, readings: impl IntoIterator<Item = LiveReading>) -> Result<bool, QueueClosedError> {
+        let mut readings = readings.into_iter().peekable();
         let mut state = locked(&self.state);
         let mut unreported = locked(&self.drops.unreported);
         // Reports of drops get the same stamp, so that the time of a captured drive never jumps to the clock's and
         // back.
-        let arrival_ns = captured_ns.unwrap_or_else(|| self.clock.now_ns());
+        let now_ns = match readings.peek() {
+            Some(LiveReading { arrival: Arrival::Captured(captured_ns), .. }) => *captured_ns,
+            _ => self.clock.now_ns(),
+        };
         // Reports come before the readings, so that the journal has the drops where they happened.
-        let (is_due, mut has_space) = (state.is_report_due(arrival_ns), true);
+        let (is_due, mut has_space) = (state.is_report_due(now_ns), true);
         while let Some(key) = next_unreported(&unreported, is_due).filter(|_| has_space) {
             match self.try_acquire() {
-                Some(permit) => state.push_report(permit.into(), &mut unreported, key, arrival_ns)?,
+                Some(permit) => state.push_report(permit.into(), &mut unreported, key, now_ns)?,
                 None => has_space = false,
             }
         }
-        for (source, stamp_ns, body, receipt) in readings {
-            let is_plausible = |ns: &i64| captured_ns.is_some() || is_age_plausible(arrival_ns, *ns);
-            let arrival_ns = stamp_ns.filter(is_plausible).unwrap_or(arrival_ns);
+        for LiveReading { arrival, source, body, receipt } in readings {
+            let arrival_ns = match arrival {
+                Arrival::Received(Some(received_ns)) if is_age_plausible(now_ns, received_ns) => received_ns,
+                Arrival::Captured(captured_ns) => captured_ns,
+                _ => now_ns,
+            };
+            let shares = self.shares.as_ref().filter(|_| matches!(arrival, Arrival::Received(_)));
             let share = shares.map(|shares| shares.try_acquire(source));
             if let Some(None) = share {
                 *unreported.entry((Cause::Queue, source)).or_default() += 1;

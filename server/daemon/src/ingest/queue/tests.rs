@@ -5,6 +5,16 @@ use clearway_mapping::ledger::Ledger;
 use super::*;
 use crate::ingest::receipt::ObservationId;
 
+/// A reading that arrives now.
+fn reading(source: u16, body: Body) -> LiveReading {
+    LiveReading::new(Arrival::Now, source, body)
+}
+
+/// A datagram of a sensor.
+fn datagram(source: u16, received_ns: Option<i64>) -> LiveReading {
+    LiveReading::new(Arrival::Received(received_ns), source, Body::End)
+}
+
 fn unreported(queue: &EventQueue) -> Ledger {
     let mut ledger = Ledger::default();
     queue.drops().add_unreported_to(&mut ledger, []);
@@ -14,11 +24,11 @@ fn unreported(queue: &EventQueue) -> Ledger {
 #[test]
 fn events_are_numbered_without_gaps_and_a_full_queue_becomes_one_loss() {
     let (queue, events) = event_queue(2);
-    queue.push_batch((0..5).map(|_| (1, Body::End))).unwrap();
+    queue.push((0..5).map(|_| reading(1, Body::End))).unwrap();
     assert_eq!(unreported(&queue).lost, 3);
     let received: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
     assert_eq!(received.iter().map(|e| e.sequence).collect::<Vec<_>>(), [0, 1]);
-    queue.push(0, Body::End).unwrap();
+    queue.push([reading(0, Body::End)]).unwrap();
     let received: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
     assert_eq!(received[0].body, Body::Lost { cause: Cause::Queue, count: 3 });
     assert_eq!((received[0].sequence, received[0].source), (2, 1));
@@ -34,7 +44,7 @@ fn drops_are_reported_at_once_then_seldom_and_completely_at_the_end() {
     queue.record_drop(1, Cause::Length, 2);
     let ledger = unreported(&queue);
     assert_eq!((ledger.received, ledger.refused["source"], ledger.refused["length"]), (11, 9, 2));
-    queue.push(0, Body::End).unwrap();
+    queue.push([reading(0, Body::End)]).unwrap();
     let bodies = |events: &Receiver<QueuedEvent>| events.try_iter().map(|queued| queued.event.body).collect::<Vec<_>>();
     let lost = |cause, count| Body::Lost { cause, count };
     assert_eq!(bodies(&events), [lost(Cause::Sender, 9), lost(Cause::Length, 2), Body::End]);
@@ -51,11 +61,14 @@ fn drops_are_reported_at_once_then_seldom_and_completely_at_the_end() {
 #[test]
 fn a_receipt_delivers_that_the_queue_was_full_or_the_engine_stopped() {
     let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
-    let receipt = |number| Receipt::new(ObservationId { client: 0, number }, None, &sender);
+    let observation = |number, arrival| {
+        let receipt = Receipt::new(ObservationId { client: 0, number }, None, &sender);
+        [LiveReading { receipt: Some(receipt), ..LiveReading::new(arrival, 0, Body::End) }]
+    };
     let (queue, events) = event_queue(1);
-    queue.push_observation(Some(42), 0, Body::End, receipt(1)).unwrap();
+    queue.push(observation(1, Arrival::Captured(42))).unwrap();
     assert!(outcomes.try_recv().is_err(), "the engine has not handled the event yet");
-    queue.push_observation(None, 0, Body::End, receipt(2)).unwrap();
+    queue.push(observation(2, Arrival::Now)).unwrap();
     let (id, outcome) = outcomes.try_recv().unwrap();
     assert!(id.number == 2 && matches!(outcome, Outcome::Refused { reason: "queue", .. }), "{outcome:?}");
     assert_eq!(unreported(&queue).lost, 1, "the loss is also reported to the engine");
@@ -65,7 +78,7 @@ fn a_receipt_delivers_that_the_queue_was_full_or_the_engine_stopped() {
     first.unwrap().deliver(Outcome::Accepted);
     assert_eq!(outcomes.try_recv().unwrap().1, Outcome::Accepted);
     drop(events);
-    assert_eq!(queue.push_observation(None, 0, Body::End, receipt(3)), Err(QueueClosedError));
+    assert_eq!(queue.push(observation(3, Arrival::Now)), Err(QueueClosedError));
     assert!(matches!(outcomes.try_recv().unwrap().1, Outcome::Refused { reason: "stopped", .. }));
 }
 
@@ -74,19 +87,18 @@ fn a_closed_queue_ends_after_its_events_although_clones_remain() {
     let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
     let (queue, events) = event_queue(2);
     let clone = queue.clone();
-    queue.push(0, Body::End).unwrap();
+    queue.push([reading(0, Body::End)]).unwrap();
     queue.close();
     assert_eq!(events.iter().count(), 1);
-    let receipt = Receipt::new(ObservationId { client: 0, number: 1 }, None, &sender);
-    assert_eq!(clone.push_observation(None, 0, Body::End, receipt), Err(QueueClosedError));
+    let receipt = Some(Receipt::new(ObservationId { client: 0, number: 1 }, None, &sender));
+    assert_eq!(clone.push([LiveReading { receipt, ..reading(0, Body::End) }]), Err(QueueClosedError));
     assert!(matches!(outcomes.try_recv().unwrap().1, Outcome::Refused { reason: "stopped", .. }));
 }
 
 #[test]
 fn a_captured_reading_follows_the_refusals_before_it_all_at_its_own_stamp() {
     let (queue, events) = event_queue(4);
-    let reading = |arrival_ns| Reading { arrival_ns, source: 0, body: Body::End };
-    let push = |arrival_ns| queue.push_captured(reading(arrival_ns)).unwrap();
+    let push = |arrival_ns| queue.push_captured(Reading { arrival_ns, source: 0, body: Body::End }).unwrap();
     let mut received = events.iter().map(|queued| (queued.event.arrival_ns, queued.event.body));
     let refused = |count| Body::Lost { cause: Cause::Observation, count };
     queue.drops().record_refused_messages(1, "ros_message", 2);
@@ -104,14 +116,14 @@ fn a_captured_reading_follows_the_refusals_before_it_all_at_its_own_stamp() {
 #[test]
 fn live_readings_are_counted_while_a_captured_reading_waits_for_space() {
     let (queue, events) = event_queue(1);
-    queue.push(0, Body::End).unwrap();
+    queue.push([reading(0, Body::End)]).unwrap();
     let waiting = std::thread::spawn({
         let queue = queue.clone();
         move || queue.push_captured(Reading { arrival_ns: 42, source: 0, body: Body::End })
     });
     // It makes no difference whether the other thread has begun to wait.
     for _ in 0..3 {
-        queue.push(1, Body::End).unwrap();
+        queue.push([reading(1, Body::End)]).unwrap();
     }
     assert_eq!(unreported(&queue).lost, 3);
     let received: Vec<_> = events.iter().take(3).map(|queued| queued.event).collect();
@@ -120,7 +132,7 @@ fn live_readings_are_counted_while_a_captured_reading_waits_for_space() {
     assert_eq!(received.iter().map(|event| event.sequence).collect::<Vec<_>>(), [0, 1, 2]);
     assert_eq!(received[2].arrival_ns, 42);
 
-    queue.push(0, Body::End).unwrap();
+    queue.push([reading(0, Body::End)]).unwrap();
     let waiting = std::thread::spawn({
         let queue = queue.clone();
         move || queue.push_captured(Reading { arrival_ns: 43, source: 0, body: Body::End })
@@ -133,15 +145,15 @@ fn live_readings_are_counted_while_a_captured_reading_waits_for_space() {
 fn a_flood_from_one_sensor_leaves_the_share_of_another() {
     let (queue, events) = event_queue(16);
     let queue = queue.with_shares(8, 2);
-    queue.push_received((0..100).map(|_| (0, None, Body::End))).unwrap();
-    queue.push_received((0..4).map(|_| (1, None, Body::End))).unwrap();
+    queue.push((0..100).map(|_| datagram(0, None))).unwrap();
+    queue.push((0..4).map(|_| datagram(1, None))).unwrap();
     let of = |events: &Receiver<QueuedEvent>, source| {
         let readings = events.try_iter().filter(|queued| queued.event.body == Body::End);
         readings.filter(|queued| queued.event.source == source).count()
     };
     assert_eq!(unreported(&queue).lost, 0, "the second push reported the loss of the first");
     assert_eq!(of(&events, 1), 4);
-    queue.push_received((0..100).map(|_| (0, None, Body::End))).unwrap();
+    queue.push((0..100).map(|_| datagram(0, None))).unwrap();
     assert_eq!((of(&events, 0), unreported(&queue).lost), (4, 96), "the share is free again");
 }
 
@@ -150,7 +162,7 @@ fn a_datagram_has_the_kernels_stamp_if_that_is_plausible() {
     let now_ns = 1_000 * RECEIVED_AGE_NS_MAX;
     let (queue, events) = event_queue_with_clock(Clock::new(move || now_ns), 8);
     let stamps = [Some(now_ns - 4_000_000_000), None, Some(now_ns + 1), Some(now_ns - RECEIVED_AGE_NS_MAX - 1)];
-    queue.push_received(stamps.map(|ns| (0, ns, Body::End))).unwrap();
+    queue.push(stamps.map(|ns| datagram(0, ns))).unwrap();
     let arrivals: Vec<_> = events.try_iter().map(|queued| queued.event.arrival_ns).collect();
     assert_eq!(arrivals, [now_ns - 4_000_000_000, now_ns, now_ns, now_ns]);
 }
@@ -159,5 +171,5 @@ fn a_datagram_has_the_kernels_stamp_if_that_is_plausible() {
 fn a_queue_without_an_engine_refuses_readings() {
     let (queue, events) = event_queue(2);
     drop(events);
-    assert_eq!(queue.push(0, Body::End), Err(QueueClosedError));
+    assert_eq!(queue.push([reading(0, Body::End)]), Err(QueueClosedError));
 }

@@ -19,7 +19,7 @@ use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig}
 use super::decoder::{PoseSource, TopicDecoder};
 use crate::base::sync::locked;
 use crate::config::Ros;
-use crate::ingest::queue::EventQueue;
+use crate::ingest::queue::{Arrival, EventQueue, LiveReading};
 use crate::ingest::sensor_senders::SensorSender;
 use crate::zenoh_session::ZenohError;
 
@@ -129,7 +129,7 @@ impl SampleReceiver {
             if let Some(sender) = &sender {
                 self.queue.drops().senders.note(reading.source, &reading.body, sender, now);
             }
-            if self.queue.push(reading.source, reading.body).is_err() {
+            if self.queue.push([LiveReading::new(Arrival::Now, reading.source, reading.body)]).is_err() {
                 return;
             }
         }

@@ -5,12 +5,11 @@
 //! event queue, which counts them, and not in the kernel's buffer.
 //!
 //! To wake a thread costs more than to read a datagram. So a thread that has read datagrams faster than one a pause
-//! ([`pause`]) reads again after a pause, and the kernel keeps and stamps what arrives meanwhile.
+//! ([`PAUSE`]) reads again after a pause, and the kernel keeps and stamps what arrives meanwhile.
 
 use std::collections::BTreeSet;
 use std::io::{self, PipeReader, PipeWriter};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::ops::RangeInclusive;
 use std::os::fd::AsFd;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -23,18 +22,14 @@ use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
 use crate::base::held_sockets::HeldSockets;
 use crate::config::{Listener, Vehicle, listeners};
-use crate::ingest::queue::{EventQueue, QueueClosedError};
+use crate::ingest::queue::{Arrival, EventQueue, LiveReading, QueueClosedError};
 use crate::ingest::sensor_senders::SensorSender;
 
 mod receive;
 
-/// Least and greatest time between two reads of a socket whose datagrams come faster. Ours: a map is that much later
-/// at most. After 1 ms the threads of one HDL-64E wake a third as often; after 4 ms its kernel buffer holds a sixth of
-/// what the kernel's own default allows.
-const PAUSE_MS: RangeInclusive<u32> = 1..=4;
-/// Number of sockets of which each further one lengthens the pause by a millisecond. Ours: four vehicles with sockets
-/// for packets and for telemetry; then the threads of all sockets wake 4,000 times a second, however many there are.
-const SOCKETS_A_MS: u32 = 8;
+/// Time between two reads of a socket whose datagrams come faster. Ours: a map is that much later at most, and the
+/// threads of one HDL-64E wake a third as often.
+const PAUSE: Duration = Duration::from_millis(1);
 
 pub use receive::{BATCH, DATAGRAM_BYTES_MAX, Received, Receiver};
 
@@ -84,14 +79,13 @@ impl Sockets {
     /// [`io::Error`] if the system cannot create a thread or pipe.
     pub fn start(self, queues: &[EventQueue]) -> io::Result<UdpThreads> {
         let (stopped, stop) = io::pipe()?;
-        let pause = pause(self.0.len());
         let mut threads = Vec::new();
         for (socket, at, listener) in self.0 {
             let (queues, stopped) = (queues.to_vec(), stopped.try_clone()?);
             let run = move || {
                 let mut watch =
                     ThreadWatch { at, listener: &listener, queues: &queues, fault: Some("it panicked".into()) };
-                watch.fault = receive(socket, &listener, &queues, &stopped, pause).err().map(|error| error.to_string());
+                watch.fault = receive(socket, &listener, &queues, &stopped).err().map(|error| error.to_string());
             };
             threads.push(std::thread::Builder::new().name(format!("udp {}", at.port())).spawn(run)?);
         }
@@ -195,20 +189,8 @@ fn join_group(socket: &Socket, group: IpAddr, interface: &str) -> io::Result<()>
     }
 }
 
-/// Time between two reads of a socket whose datagrams come faster, in a server with so many sockets.
-fn pause(sockets: usize) -> Duration {
-    let ms = u32::try_from(sockets).unwrap_or(u32::MAX) / SOCKETS_A_MS;
-    Duration::from_millis(ms.clamp(*PAUSE_MS.start(), *PAUSE_MS.end()).into())
-}
-
 /// Reads one socket until the other end of `stopped` is closed, or until all engines behind the socket have stopped.
-fn receive(
-    socket: Socket,
-    listener: &Listener,
-    queues: &[EventQueue],
-    stopped: &PipeReader,
-    pause: Duration,
-) -> io::Result<()> {
+fn receive(socket: Socket, listener: &Listener, queues: &[EventQueue], stopped: &PipeReader) -> io::Result<()> {
     let mut receiver = Receiver::new(socket)?;
     let mut batches: Vec<VehicleBatch> = Vec::new();
     for route in &listener.routes {
@@ -236,11 +218,11 @@ fn receive(
         if batches.is_empty() {
             return Ok(());
         }
-        let is_fast = read > 1 || last_read.is_some_and(|last| last.elapsed() < pause);
+        let is_fast = read > 1 || last_read.is_some_and(|last| last.elapsed() < PAUSE);
         last_read = Some(Instant::now());
         // After a whole batch more datagrams may wait.
         if is_fast && read < BATCH {
-            std::thread::sleep(pause);
+            std::thread::sleep(PAUSE);
         }
     }
     for batch in batches {
@@ -251,16 +233,16 @@ fn receive(
 }
 
 /// The datagrams of one receive call for one vehicle.
+#[derive(Debug)]
 struct VehicleBatch<'a> {
     vehicle: usize,
     queue: &'a EventQueue,
-    /// Index of the sensor, time at which the kernel received the datagram, and the datagram.
-    readings: Vec<(u16, Option<i64>, Body)>,
+    readings: Vec<LiveReading>,
 }
 
 impl VehicleBatch<'_> {
     fn push(&mut self) -> Result<(), QueueClosedError> {
-        if self.readings.is_empty() { Ok(()) } else { self.queue.push_received(self.readings.drain(..)) }
+        if self.readings.is_empty() { Ok(()) } else { self.queue.push(self.readings.drain(..)).map(drop) }
     }
 }
 
@@ -285,7 +267,7 @@ fn route(datagram: Received, listener: &Listener, batches: &mut [VehicleBatch<'_
         if datagram.length != TELEMETRY_LENGTH {
             batch.queue.drops().senders.note(route.source, &body, &SensorSender::Address(peer), now);
         }
-        batch.readings.push((route.source, datagram.received_ns, body));
+        batch.readings.push(LiveReading::new(Arrival::Received(datagram.received_ns), route.source, body));
     }
 }
 
@@ -307,12 +289,6 @@ mod tests {
     use super::*;
     use crate::config::{Config, Udp};
     use crate::ingest::queue::event_queue;
-
-    #[test]
-    fn many_sockets_are_read_less_often() {
-        let ms = [1, 2, 8, 16, 31, 32, 1000].map(|sockets| pause(sockets).as_millis());
-        assert_eq!(ms, [1, 1, 1, 2, 3, 4, 4]);
-    }
 
     #[test]
     fn a_thread_that_ends_by_a_fault_is_known_to_its_vehicles() {
@@ -337,7 +313,11 @@ mod tests {
         let datagram = |peer| Received { peer, received_ns: Some(7), length: 3, payload: "abc".into() };
         route(datagram(None), listener, &mut batches, Instant::now());
         route(datagram(Some(([10, 0, 0, 1], 2368).into())), listener, &mut batches, Instant::now());
-        assert_eq!(batches[0].readings, [(0, Some(7), Body::Datagram("abc".into()))]);
+        let [LiveReading { arrival: Arrival::Received(Some(7)), source: 0, body, .. }] = &batches[0].readings[..]
+        else {
+            panic!("{batches:?}")
+        };
+        assert_eq!(*body, Body::Datagram("abc".into()));
         let mut ledger = Ledger::default();
         queue.drops().add_unreported_to(&mut ledger, []);
         assert_eq!((ledger.received, ledger.refused), (1, [("source", 1)].into()));
