@@ -62,8 +62,9 @@ impl Traces {
 
     /// Traces a map that has just been published, and the stages until then that are known: in the queue, computed,
     /// encoded, and in all since the end of capture.
-    pub fn published(&self, map: &EncodedMap, [waited, computed, encoded, age]: [Option<Duration>; 4]) {
+    pub fn published(&self, map: &EncodedMap, stages: StageTimes) {
         let Some(exporting) = &self.0 else { return };
+        let StageTimes { receive: waited, map: computed, encode: encoded, total: age } = stages;
         let end = SystemTime::now();
         let encode = before(end, encoded);
         let compute = before(encode, computed);
@@ -97,6 +98,30 @@ impl Traces {
         if let Some(Err(error)) = self.0.map(|exporting| exporting.provider.shutdown_with_timeout(SHUTDOWN_TIMEOUT)) {
             tracing::warn!(%error, "the last traces are lost");
         }
+    }
+}
+
+/// Time that a map took in each stage, in the order of the data's way; `None` where it is not known, as for data of a
+/// recording.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StageTimes {
+    /// From the arrival of the map's event until the engine took it.
+    pub receive: Option<Duration>,
+    /// Computation.
+    pub map: Option<Duration>,
+    /// Encoding.
+    pub encode: Option<Duration>,
+    /// From the end of the capture until the publication.
+    pub total: Option<Duration>,
+}
+
+impl StageTimes {
+    /// Names of the stages, in the order of [`StageTimes::in_order`].
+    pub const NAMES: [&str; 4] = ["receive", "map", "encode", "total"];
+
+    /// The times by stage.
+    pub fn in_order(self) -> [Option<Duration>; Self::NAMES.len()] {
+        [self.receive, self.map, self.encode, self.total]
     }
 }
 

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use clearway_daemon::base::clock::Clock;
 use clearway_daemon::config::Config;
 use clearway_daemon::engine::Engine;
+use clearway_daemon::engine::wires::Wires;
 use clearway_daemon::ingest::gateway::Gateway;
 use clearway_daemon::ingest::queue::{EventQueue, QueuedEvent, event_queue_with_clock};
 use clearway_daemon::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOutcome, OutcomeSender};
@@ -108,6 +109,7 @@ impl<'a> TestBed<'a> {
             // The disk is full before the first event: the run goes on without a recording.
             Err(_) => (None, None),
         };
+        let wires = Wires::new(&layers);
         let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), queue.drops()));
         writer.iter().for_each(|writer| status.show_recorder(writer.counts()));
         let (newest, receiver) = watch::channel(None);
@@ -117,6 +119,7 @@ impl<'a> TestBed<'a> {
             pipeline,
             valid_ms,
             newest,
+            wires: wires.clone(),
             recording: journal,
             status: status.clone(),
             observer: None,
@@ -134,7 +137,7 @@ impl<'a> TestBed<'a> {
             queue,
             events,
             engine,
-            vehicles: Vehicles(vec![Served { status, newest: receiver }].into()),
+            vehicles: Vehicles(vec![Served { status, newest: receiver, wires }].into()),
             maps: Vec::new(),
             taken: 0,
             epoch: 0,

@@ -396,7 +396,7 @@ async fn layers_are_made_while_subscribed_and_at_once_for_a_late_joiner() {
 
     let without_layers = newest();
     let (requests, mut updates) = watch(&running, 0).await;
-    let subscriptions = running.vehicles.0[0].status.subscriptions.clone();
+    let subscriptions = running.vehicles.0[0].wires.subscriptions.clone();
     until("the reader's layer is subscribed", || subscriptions.is_subscribed(LAYER)).await;
     assert!(!subscriptions.is_subscribed("terrain"));
     let update = within("the newest revolution's map", updates.message()).await.unwrap().unwrap();

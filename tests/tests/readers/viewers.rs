@@ -58,7 +58,7 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
     send_poses(&running, &readings).await;
     feed(&running, readings).await;
     // As at the end of a replay.
-    running.vehicles.0[0].status.replay_ended.send_replace(true);
+    running.vehicles.0[0].wires.replay_ended.send_replace(true);
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
     let received = tokio::task::spawn_blocking(move || {
         venv::run(venv::script("ros_topics.py").args([&endpoint, "7"]), "the script names what it missed")
@@ -135,7 +135,7 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
     let rest = readings.split_off(readings.len() / 2);
     feed(&running, readings).await;
     // As at the end of a replay.
-    running.vehicles.0[0].status.replay_ended.send_replace(true);
+    running.vehicles.0[0].wires.replay_ended.send_replace(true);
     let address = format!("ws://{}", running.foxglove.expect("Foxglove is served"));
     let map = newest(&running);
 

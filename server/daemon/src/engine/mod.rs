@@ -8,12 +8,14 @@
 //! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`subscriptions`] | readers -> layers to compute |
 //! | [`acknowledgements`] | readers that acknowledge -> the maps that they have finished with |
+//! | [`wires`] | the channels between the engine and its readers |
 //! | [`compute_permits`] | engines with events -> the engines that compute at once |
 
 pub mod acknowledgements;
 pub mod compute_permits;
 pub mod newest;
 pub mod subscriptions;
+pub mod wires;
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
@@ -30,10 +32,12 @@ use tokio::sync::watch;
 use crate::base::clock::now_ns;
 use crate::engine::compute_permits::{ComputePermit, ComputePermits};
 use crate::engine::newest::Newest;
+use crate::engine::wires::Wires;
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::receipt::Outcome;
 use crate::record::writer::RecordingHandle;
 use crate::status::{MadeMap, VehicleStatus};
+use crate::traces::StageTimes;
 use clearway_journal::encode::{self, EncodedMap, Replayed};
 
 /// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200
@@ -51,6 +55,8 @@ pub struct Engine {
     pub valid_ms: u32,
     /// The latest-value slot of the map.
     pub newest: watch::Sender<Newest>,
+    /// The other channels to the readers.
+    pub wires: Wires,
     /// The vehicle's handle of the recording, if there is one.
     pub recording: Option<RecordingHandle>,
     /// The status that shows ledger, rates and latency.
@@ -111,7 +117,7 @@ impl Engine {
     pub fn publish_newest_map(&mut self) {
         if self.pipeline.newest_map().is_none() {
             self.newest.send_replace(None);
-            self.status.sweeps.send_replace(None);
+            self.wires.sweeps.send_replace(None);
         }
         self.publish(Instant::now(), None);
     }
@@ -185,56 +191,74 @@ impl Engine {
     fn publish(&mut self, began: Instant, waited: Option<Duration>) {
         let computed = began.elapsed();
         let Some(map) = self.pipeline.newest_map() else { return };
+        let (states, speed_m_s) = (map.present_sensors().map(encode::sensor).collect(), map.speed_mps);
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
         let encoded = (!self.status.layers.is_empty()).then(|| {
-            let states = map.present_sensors().map(encode::sensor).collect();
             let (name, boot_id) = (self.status.name.clone(), self.status.boot_id);
-            (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
+            Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed))
         });
         let encoding = began.elapsed().saturating_sub(computed);
-        let speed_m_s = map.speed_mps;
         // The points come before the map, so that a reader of the map finds its points.
-        if self.status.sweeps.receiver_count() > 0 {
-            let sweep = self.pipeline.newest_sweep().clone();
-            let stamp_ns = encoded.as_ref().map_or(map.capture_end_ns, |(encoded, _)| encoded.capture_end_ns);
-            self.status.sweeps.send_replace(Some(Arc::new((stamp_ns, sweep))));
-        }
+        self.publish_points(encoded.as_ref().map_or(map.capture_end_ns, |encoded| encoded.capture_end_ns));
         // The status comes before the map too, so that a reader of the map finds it counted.
         self.update_status();
-        if let Some((encoded, states)) = encoded {
+        if let Some(encoded) = encoded {
             let total = duration(now_ns().saturating_sub(encoded.capture_end_ns));
-            // A jump of a replay as recorded has a header of its own too, with the recorded stamps.
-            let is_shifted = self.replayed.is_some_and(|replayed| replayed.shift_ns != 0);
-            // The stamps of a recording say nothing of this run.
-            let is_live = !is_shifted && !self.status.is_from_files();
-            self.status.mapped(MadeMap {
-                encoded: &encoded,
-                states,
-                stages: [
-                    waited.filter(|_| is_live),
-                    Some(computed),
-                    Some(encoding),
-                    total.filter(|_| is_live || is_shifted),
-                ],
-                validity: Duration::from_millis(self.valid_ms.into()),
-                speed_m_s,
-                is_shifted,
-            });
-            self.newest.send_replace(Some(encoded.clone()));
-            if let Some(recording) = &mut self.recording {
-                recording.record_map(&encoded, self.status.traces.hop(&encoded, "record", None));
-            }
+            let stages = StageTimes { receive: waited, map: Some(computed), encode: Some(encoding), total };
+            self.publish_map(encoded, states, speed_m_s, stages);
         }
         if let Some(observer) = &mut self.observer {
             observer(&self.pipeline);
         }
     }
 
+    /// Gives the points of the newest map, with its stamp, to readers that subscribe to them.
+    fn publish_points(&self, stamp_ns: i64) {
+        if self.wires.sweeps.receiver_count() > 0 {
+            let sweep = self.pipeline.newest_sweep().clone();
+            self.wires.sweeps.send_replace(Some(Arc::new((stamp_ns, sweep))));
+        }
+    }
+
+    /// Gives the newest map to the status, the readers and the recorder.
+    fn publish_map(
+        &mut self,
+        encoded: Arc<EncodedMap>,
+        states: Vec<v1::SensorState>,
+        speed_m_s: Option<f64>,
+        StageTimes { receive, map, encode, total }: StageTimes,
+    ) {
+        // A jump of a replay as recorded has a header of its own too, with the recorded stamps.
+        let is_shifted = self.replayed.is_some_and(|replayed| replayed.shift_ns != 0);
+        // The stamps of a recording say nothing of this run.
+        let is_live = !is_shifted && !self.status.is_from_files();
+        let (receive, total) = (receive.filter(|_| is_live), total.filter(|_| is_live || is_shifted));
+        self.status.mapped(MadeMap {
+            encoded: &encoded,
+            states,
+            stages: StageTimes { receive, map, encode, total },
+            validity: Duration::from_millis(self.valid_ms.into()),
+            speed_m_s,
+            is_shifted,
+        });
+        self.newest.send_replace(Some(encoded.clone()));
+        if let Some(recording) = &mut self.recording {
+            recording.record_map(&encoded, self.status.traces.hop(&encoded, "record", None));
+        }
+    }
+
+    /// Records the phase of the replay that makes the maps, and tells readers of its end.
+    pub fn set_replay_phase(&self, phase: v1::ReplayPhase) {
+        self.status.set_replay_phase(phase);
+        let ended = phase == v1::ReplayPhase::Ended;
+        self.wires.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
+    }
+
     /// Makes the pipeline compute the layers that have subscribers. While it records it computes all layers, because a
     /// replay does not have the readers of the recorded run.
     fn update_layers(&mut self) {
         let all = self.recording.as_ref().is_some_and(RecordingHandle::is_recording);
-        let subscriptions = &self.status.subscriptions;
+        let subscriptions = &self.wires.subscriptions;
         self.pipeline.set_active_layers(|layer| all || subscriptions.is_subscribed(layer));
     }
 }

@@ -93,7 +93,7 @@ impl Player {
     ) -> Result<Self, FilesError> {
         let state = input.state.borrow().clone();
         let readings = timeline.start(0)?;
-        vehicles.iter().for_each(|vehicle| vehicle.engine.status.set_replay_phase(state.phase()));
+        vehicles.iter().for_each(|vehicle| vehicle.engine.set_replay_phase(state.phase()));
         let copies = vehicles.iter().filter(|_| options.is_served);
         let copies = copies.map(|vehicle| (vehicle.engine.pipeline.clone(), vehicle.queue.position())).collect();
         Ok(Self {
@@ -283,7 +283,7 @@ impl Player {
         let mut made = None;
         for (_, ReplayedVehicle { engine, events, .. }) in vehicles.filter(|(i, _)| vehicle.is_none_or(|v| v == *i)) {
             let before = engine.maps();
-            engine.status.acknowledgements.set_lockstep(state.lockstep);
+            engine.wires.acknowledgements.set_lockstep(state.lockstep);
             while let Ok(queued) = events.try_recv() {
                 engine.replayed = clock.replayed(state, boot_id, state.position_ns, now_ns);
                 engine.step(queued);
@@ -342,8 +342,9 @@ impl Player {
         let engine = &self.vehicles[vehicle].engine;
         let (status, vehicle) = (&engine.status, engine.status.name.to_string());
         let boot_id = engine.replayed.map_or(status.boot_id, |replayed| replayed.boot_id);
-        let mut changes = status.acknowledgements.changes();
-        let awaited = status.acknowledgements.awaited((boot_id, sequence));
+        let acknowledgements = &engine.wires.acknowledgements;
+        let mut changes = acknowledgements.changes();
+        let awaited = acknowledgements.awaited((boot_id, sequence));
         if !self.state.lockstep || awaited.as_ref().is_some_and(Vec::is_empty) {
             self.awaited = None;
             self.state.awaited.clear();
@@ -353,7 +354,7 @@ impl Player {
         if since.elapsed() >= self.options.acknowledge_timeout {
             let seconds = self.options.acknowledge_timeout.as_secs_f64();
             let error = PlayError::Unacknowledged { vehicle, sequence, seconds, readers };
-            status.acknowledgements.time_out(error.to_string());
+            acknowledgements.time_out(error.to_string());
             return Err(error);
         }
         if since.elapsed() >= REPORT {
@@ -465,7 +466,7 @@ impl Player {
         self.clock.pause();
         for vehicle in &self.vehicles {
             vehicle.engine.update_status();
-            vehicle.engine.status.set_replay_phase(phase);
+            vehicle.engine.set_replay_phase(phase);
         }
         tracing::debug!(?phase, jumps = %counted(self.state.jumps, "jump"), "replay");
         self.report();

@@ -205,7 +205,7 @@ impl VehicleChannels {
         let mut rasters = Rasters::default();
         let mut sweeps = None;
         newest.mark_changed();
-        let mut replay_ended = self.served.status.replay_ended.subscribe();
+        let mut replay_ended = self.served.wires.replay_ended.subscribe();
         // What is so from the beginning is no change.
         let mut reported = false;
         loop {
@@ -225,7 +225,7 @@ impl VehicleChannels {
             }
             let has_points = |channel: &Channel| channel.kind == Kind::Points && channel.newest.receiver_count() > 0;
             match self.channels.iter().any(has_points) {
-                true => _ = sweeps.get_or_insert_with(|| self.served.status.sweeps.subscribe()),
+                true => _ = sweeps.get_or_insert_with(|| self.served.wires.sweeps.subscribe()),
                 false => sweeps = None,
             }
             let map = newest.borrow_and_update().clone();
@@ -402,7 +402,7 @@ impl Client {
                     }
                     let found = self.channels().find(|(_, channel)| channel.id == channel_id);
                     let (of, channel) = found.ok_or_else(|| format!("channel {channel_id} is not known"))?;
-                    let layer = channel.layer().map(|layer| of.served.status.subscriptions.subscribe(&[layer.into()]));
+                    let layer = channel.layer().map(|layer| of.served.wires.subscriptions.subscribe(&[layer.into()]));
                     let mut newest = channel.newest.subscribe();
                     newest.mark_changed();
                     of.subscribed.notify_one();

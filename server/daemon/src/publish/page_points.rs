@@ -59,7 +59,7 @@ impl PagePoints {
                 "points of {vehicle}: a reader of all its layers may have them, and layer {layer} is not allowed"
             ))),
             None => {
-                let sweeps = served.status.sweeps.subscribe();
+                let sweeps = served.wires.sweeps.subscribe();
                 Ok(Self { vehicle: vehicle.clone(), sweeps, is_due: false, not_before: Instant::now() })
             }
         }

@@ -182,7 +182,7 @@ impl Topic {
                     Err(_) => return,
                 }
             }
-            let _subscription = layer.map(|layer| served.status.subscriptions.subscribe(&[layer.to_owned()]));
+            let _subscription = layer.map(|layer| served.wires.subscriptions.subscribe(&[layer.to_owned()]));
             let mut reader = Reader::new(&served.status.transports, Transport::Ros);
             newest.mark_changed();
             loop {
@@ -212,7 +212,7 @@ impl Topic {
 
     /// Sends whether a replay has ended, now and whenever that changes, after the last map.
     async fn publish_replay_end(mut self, served: Served) {
-        let mut ended = served.status.replay_ended.subscribe();
+        let mut ended = served.wires.replay_ended.subscribe();
         loop {
             let has_ended = *ended.borrow_and_update();
             let mut message = Writer::default();

@@ -6,6 +6,7 @@ use tokio::sync::watch;
 
 use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::engine::newest::Newest;
+use crate::engine::wires::Wires;
 use crate::status::VehicleStatus;
 
 /// One vehicle, as publishers use it.
@@ -15,6 +16,8 @@ pub struct Served {
     pub status: Arc<VehicleStatus>,
     /// The newest map; the channel closes when the vehicle's engine stops.
     pub newest: watch::Receiver<Newest>,
+    /// The other channels to the vehicle's engine.
+    pub wires: Wires,
 }
 
 /// All vehicles, in the order of the configuration.

@@ -101,7 +101,7 @@ impl Publisher {
     pub async fn stop(mut self) {
         self.tasks.shutdown().await;
         for (served, replay) in &self.replays {
-            if served.status.acknowledgements.why_timed_out().is_some() {
+            if served.wires.acknowledgements.why_timed_out().is_some() {
                 put_replay(served, replay).await;
             }
         }
@@ -209,7 +209,7 @@ impl Publisher {
     async fn answer(&mut self, served: &Served, layer: &'static str, key: String) -> Result<(), ZenohError> {
         let queryable = self.session.declare_queryable(key.clone()).complete(true);
         let queries = queryable.await.map_err(ZenohError::of(format!("queryable {key}")))?;
-        let (newest, subscriptions) = (served.newest.clone(), served.status.subscriptions.clone());
+        let (newest, subscriptions) = (served.newest.clone(), served.wires.subscriptions.clone());
         let signing_key = self.signing_key.clone();
         self.tasks.spawn(async move {
             while let Ok(query) = queries.recv_async().await {
@@ -240,7 +240,7 @@ async fn subscribe_while(
     loop {
         let _taken = matches.then(|| {
             (
-                served.status.subscriptions.subscribe(&[layer.to_owned()]),
+                served.wires.subscriptions.subscribe(&[layer.to_owned()]),
                 Reader::new(&served.status.transports, Transport::Zenoh),
             )
         });
@@ -278,7 +278,7 @@ async fn send_maps(
     pace: Pace,
 ) {
     let mut on_the_way = std::pin::pin!(Fuse::terminated());
-    let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
+    let (mut newest, mut replay_ended) = (served.newest.clone(), served.wires.replay_ended.subscribe());
     newest.mark_changed();
     let (mut reported, mut last, mut was_answered) = (false, None, true);
     loop {
@@ -354,8 +354,8 @@ impl Pace {
 /// Whether the replay has ended, for its key.
 fn replay_document(served: &Served) -> String {
     let newest = served.newest.borrow().clone();
-    let why = served.status.acknowledgements.why_timed_out();
-    let mut document = serde_json::json!({ "ended": *served.status.replay_ended.borrow() || why.is_some() });
+    let why = served.wires.acknowledgements.why_timed_out();
+    let mut document = serde_json::json!({ "ended": *served.wires.replay_ended.borrow() || why.is_some() });
     if let Some(map) = newest.filter(|_| document["ended"] == true) {
         document["boot_id"] = map.boot_id.into();
         document["sequence"] = map.sequence.into();

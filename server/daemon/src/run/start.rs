@@ -30,6 +30,7 @@ use crate::base::held_sockets::HeldSockets;
 use crate::config::ZenohMode;
 use crate::config::{self, Certificates, Config, Vehicle, listeners};
 use crate::engine::compute_permits::ComputePermits;
+use crate::engine::wires::Wires;
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
@@ -129,15 +130,24 @@ impl Running {
         let (queue, events) = event_queue(vehicle.queue);
         let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
         let layers = layer_names(&vehicle.maps);
+        let wires = Wires::new(&layers);
         let status = VehicleStatus::new(name.clone(), boot_id, layers, queue.drops());
         status.show_queue(queue.space());
         let status = Arc::new(status.with_outline(vehicle.body.as_ref()).with_traces(self.traces.clone()));
         let (newest, receiver) = watch::channel(None);
         let valid_ms = vehicle.maps.valid_ms;
-        let engine =
-            Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), observer, replayed: None };
+        let engine = Engine {
+            pipeline,
+            valid_ms,
+            newest,
+            wires: wires.clone(),
+            recording: None,
+            status: status.clone(),
+            observer,
+            replayed: None,
+        };
         self.inputs.push(VehicleInput { name, queue, udp: None });
-        Prepared { served: Served { status, newest: receiver }, engine, events, core }
+        Prepared { served: Served { status, newest: receiver, wires }, engine, events, core }
     }
 
     async fn start_all(
@@ -249,14 +259,14 @@ impl Running {
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
         let permits = Arc::new(ComputePermits::of_processors());
-        for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {
+        for Prepared { served: Served { status, wires, .. }, mut engine, events, core: (core, tables) } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
             if driver.from_files {
                 status.set_from_files();
             }
             // A replay computes all layers: a reader that comes late gets the last map, and the summary has all
             // metrics.
-            self.subscriptions.extend(driver.from_files.then(|| status.subscriptions.subscribe(&[])));
+            self.subscriptions.extend(driver.from_files.then(|| wires.subscriptions.subscribe(&[])));
             engine.recording = handles.next();
             engine.recording.iter_mut().for_each(|recording| recording.set_config(core.clone(), tables.clone()));
             if driver.is_stepped {
@@ -444,7 +454,7 @@ mod tests {
         let Listeners { grpc, handles, .. } = bound.expect("a free port");
         let status = VehicleStatus::new("car".into(), 1, Vec::new(), event_queue(1).0.drops());
         let (status, (_, newest)) = (Arc::new(status), watch::channel(None));
-        let vehicles = Vehicles([Served { status: status.clone(), newest }].into());
+        let vehicles = Vehicles([Served { status: status.clone(), newest, wires: Wires::new(&[]) }].into());
         let watching = tokio::spawn(watch_listeners((security, handles.clone()), vehicles, pending()));
 
         let of_listener = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();

@@ -15,7 +15,7 @@ use super::reasons::{CLOSE_REASONS, OBSERVATION_REASONS, PACKET_REASONS};
 use super::text_format::TextFormat;
 use super::transports::Transport;
 use super::vehicle::{Snapshot, VehicleStatus};
-use super::window::STAGES;
+use crate::traces::StageTimes;
 
 /// Counts of a TCP listener.
 #[derive(Clone, Debug, Default)]
@@ -161,7 +161,8 @@ impl Metrics {
         let help = "Other servers that serve a vehicle of the same name.";
         self.each("clearway_vehicle_claims", help, |of| Some(of.assessment.claimed_by.len() as f64));
         let stages = self.all.iter().flat_map(|of| {
-            STAGES.iter().zip(&of.snapshot.stages).map(|(stage, times)| (of.labels("stage", *stage), times))
+            let times = StageTimes::NAMES.iter().zip(&of.snapshot.stages);
+            times.map(|(stage, times)| (of.labels("stage", *stage), times))
         });
         let help = "Time of a map in a stage; total is from the end of capture until it is published.";
         self.text.histogram("clearway_map_latency_seconds", help, stages);

@@ -15,13 +15,10 @@ use tokio::sync::watch;
 
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
-use crate::engine::acknowledgements::Acknowledgements;
-use crate::engine::newest::NewestSweep;
-use crate::engine::subscriptions::LayerSubscriptions;
 use crate::ingest::drops::DropCounters;
 use crate::ingest::queue::QueueSpace;
 use crate::record::writer::RecorderCounts;
-use crate::traces::Traces;
+use crate::traces::{StageTimes, Traces};
 use clearway_journal::encode::EncodedMap;
 
 use super::health::{Health, State};
@@ -29,7 +26,7 @@ use super::histogram::Histogram;
 use super::network::Network;
 use super::notices::Notices;
 use super::transports::{Readers, Transport};
-use super::window::{PacketCounts, STAGES, StageTimes, Window};
+use super::window::{PacketCounts, Window};
 
 /// Latencies kept for the percentiles: seven minutes of a 10 Hz sensor.
 const LATENCIES: usize = 4096;
@@ -49,16 +46,8 @@ pub struct VehicleStatus {
     pub boot_id: u64,
     /// Names of the layers of its maps, in order.
     pub layers: Vec<&'static str>,
-    /// Subscriptions of readers to the layers.
-    pub subscriptions: LayerSubscriptions,
-    /// The newest map that each acknowledging reader has finished with.
-    pub acknowledgements: Acknowledgements,
-    /// The points of the newest map, while a reader subscribes to them.
-    pub sweeps: watch::Sender<NewestSweep>,
     /// The readers of its maps, by transport.
     pub transports: Arc<Readers>,
-    /// True while a replay stands at its end.
-    pub replay_ended: watch::Sender<bool>,
     /// Traces its maps.
     pub traces: Traces,
     /// Outline of the vehicle in the ego frame as x0, y0, x1, y1, ..., in metres; empty if none is configured.
@@ -107,8 +96,8 @@ pub(super) struct Changing {
     pub(super) replay_awaited: String,
     drivable_share: Option<f64>,
     pub(super) window: Window,
-    /// Time of all maps by stage, in the order of [`STAGES`].
-    pub(super) stages: [Histogram; STAGES.len()],
+    /// Time of all maps by stage, in the order of [`StageTimes::NAMES`].
+    pub(super) stages: [Histogram; StageTimes::NAMES.len()],
     /// Age of the newest map, sampled at each assessment.
     pub(super) ages: Histogram,
     /// Time to step and encode each of the newest maps, in ns.
@@ -169,8 +158,8 @@ pub struct Snapshot {
     pub map_rate_hz: f64,
     /// Mean size of an encoded map of the last 10 s, in bytes.
     pub map_bytes: f64,
-    /// Time of all maps by stage, in the order of [`STAGES`].
-    pub stages: [Histogram; STAGES.len()],
+    /// Time of all maps by stage, in the order of [`StageTimes::NAMES`].
+    pub stages: [Histogram; StageTimes::NAMES.len()],
     /// Age of the newest map, sampled since the server started.
     pub ages: Histogram,
 }
@@ -204,12 +193,8 @@ impl VehicleStatus {
         Self {
             name,
             boot_id,
-            subscriptions: LayerSubscriptions::new(&layers),
-            acknowledgements: Acknowledgements::default(),
-            sweeps: watch::Sender::new(None),
             layers,
             transports: Arc::default(),
-            replay_ended: watch::Sender::new(false),
             traces: Traces::default(),
             outline_m: Vec::new(),
             drops,
@@ -325,11 +310,9 @@ impl VehicleStatus {
         self.engine_beat_ms.store(ms.max(1), Ordering::Relaxed);
     }
 
-    /// Records the phase of the replay that makes the maps, and tells readers of its end.
+    /// Records the phase of the replay that makes the maps.
     pub(crate) fn set_replay_phase(&self, phase: v1::ReplayPhase) {
         locked(&self.changing).replay = Some((phase, self.started.elapsed()));
-        let ended = phase == v1::ReplayPhase::Ended;
-        self.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
     }
 
     /// Records what the replay waits for in lockstep; empty: nothing. Its data are expected from then on.
@@ -384,11 +367,10 @@ impl VehicleStatus {
         let age = Duration::from_nanos(now_ns().abs_diff(map.capture_end_ns));
         state.fresh_at = if state.has_recorded_stamps || age <= validity { at } else { state.fresh_at };
         state.window.push_map(at, stages, map.bytes());
-        for (histogram, time) in state.stages.iter_mut().zip(stages) {
+        for (histogram, time) in state.stages.iter_mut().zip(stages.in_order()) {
             time.into_iter().for_each(|time| histogram.observe(time));
         }
-        let [_, map_time, encode_time, _] = stages.map(Option::unwrap_or_default);
-        let latency = map_time + encode_time;
+        let latency = stages.map.unwrap_or_default() + stages.encode.unwrap_or_default();
         if state.latencies_ns.len() == LATENCIES {
             state.latencies_ns.pop_front();
         }

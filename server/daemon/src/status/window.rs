@@ -4,16 +4,12 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
+use crate::traces::StageTimes;
+
 /// Length of the window.
 pub const WINDOW: Duration = Duration::from_secs(10);
 /// Least time between two samples of the counts. Ours: a twentieth of the window.
 const SAMPLE_PERIOD: Duration = Duration::from_millis(500);
-
-/// Names of the stages of [`StageTimes`], in the order of the data's way.
-pub const STAGES: [&str; 4] = ["receive", "map", "encode", "total"];
-
-/// Time that a map took in each of [`STAGES`]; `None` where it is not known, as for data of a recording.
-pub type StageTimes = [Option<Duration>; 4];
 
 /// Counts of the packets of a vehicle since the server started.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -76,12 +72,13 @@ impl Window {
     /// Median time of each stage in milliseconds; stages of which no time is known are absent.
     pub fn latency_ms(&self, now: Duration) -> BTreeMap<&'static str, f64> {
         let median = |(index, stage)| {
-            let mut times: Vec<Duration> = self.recent_maps(now).filter_map(|map| map.stages[index]).collect();
+            let mut times: Vec<Duration> =
+                self.recent_maps(now).filter_map(|map| map.stages.in_order()[index]).collect();
             times.sort_unstable();
             let median = times.get(times.len().saturating_sub(1) / 2)?;
             Some((stage, median.as_secs_f64() * 1e3))
         };
-        STAGES.into_iter().enumerate().filter_map(median).collect()
+        StageTimes::NAMES.into_iter().enumerate().filter_map(median).collect()
     }
 
     /// Share of the expected packets that were lost on the way, dropped or refused, 0 to 1, with the counts of now.
@@ -110,7 +107,8 @@ mod tests {
     fn rate_size_and_latency_are_those_of_the_last_ten_seconds() {
         let mut window = Window::default();
         for map in 0..300 {
-            let stages = [None, Some(ms(if map < 150 { 90 } else { map % 9 })), Some(ms(2)), None];
+            let computed = ms(if map < 150 { 90 } else { map % 9 });
+            let stages = StageTimes { map: Some(computed), encode: Some(ms(2)), ..StageTimes::default() };
             window.push_map(ms(100 * map), stages, if map < 150 { 9 } else { 1000 });
         }
         let now = ms(29_950);
@@ -125,7 +123,7 @@ mod tests {
     #[test]
     fn a_young_server_has_a_rate_over_its_own_age() {
         let mut window = Window::default();
-        (0..20).for_each(|map| window.push_map(ms(100 * map), [None; 4], 0));
+        (0..20).for_each(|map| window.push_map(ms(100 * map), StageTimes::default(), 0));
         assert_eq!(window.map_rate_hz(ms(2000)), 10.0);
         assert_eq!(window.map_rate_hz(ms(0)), 0.0);
     }

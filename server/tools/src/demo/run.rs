@@ -85,7 +85,7 @@ pub async fn demo(
     let udp = running.inputs[0].udp.unwrap_or((nowhere, nowhere));
     let served = running.vehicles.0[0].clone();
     // The picture and the line need these layers, whether or not a reader subscribes to them.
-    let _subscription = served.status.subscriptions.subscribe(&["freespace".to_owned(), "drivability".to_owned()]);
+    let _subscription = served.wires.subscriptions.subscribe(&["freespace".to_owned(), "drivability".to_owned()]);
     // The car starts after everything else, so that its first firing is now.
     let car = DemoCar::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere), &served.newest)
         .context("the simulated car")?;

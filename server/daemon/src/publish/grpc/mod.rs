@@ -173,7 +173,7 @@ impl MapService for Maps {
         if served.newest.borrow().is_none() {
             return Err(Status::unavailable(format!("vehicle {name} has no map yet")));
         }
-        let newest = served.status.subscriptions.subscribe(&layers).newest_map(&served.newest).await;
+        let newest = served.wires.subscriptions.subscribe(&layers).newest_map(&served.newest).await;
         let map = newest.ok_or_else(|| {
             Status::unavailable(format!("vehicle {name} makes no map at present: no data arrived since the request"))
         })?;

@@ -37,7 +37,7 @@ where
 {
     let served = vehicles.find(&selection.vehicle)?;
     let selection = Selection::new(served, selection)?;
-    let finished = selection.credits.are_limited().then(|| served.status.acknowledgements.add(name));
+    let finished = selection.credits.are_limited().then(|| served.wires.acknowledgements.add(name));
     Ok(Watch::new(served, selection, requests, finished, Transport::Grpc).updates())
 }
 
@@ -92,14 +92,14 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         let mut newest = served.newest.clone();
         // The current map, if there is one, is the first update.
         newest.mark_changed();
-        let mut replay_ended = served.status.replay_ended.subscribe();
+        let mut replay_ended = served.wires.replay_ended.subscribe();
         let is_end_due = *replay_ended.borrow_and_update();
         Self {
             requests: Some(requests),
             newest,
             replay_ended,
             is_end_due,
-            subscription: served.status.subscriptions.subscribe(&selection.layers),
+            subscription: served.wires.subscriptions.subscribe(&selection.layers),
             traces: served.status.traces.clone(),
             transport,
             last: None,
