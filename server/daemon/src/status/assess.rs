@@ -49,7 +49,7 @@ pub async fn watch_states(statuses: Vec<Arc<VehicleStatus>>) {
             let age_ms = status.assess().map_age_ms;
             if let Some(age_ms) = age_ms {
                 let age = Duration::from_secs_f64(age_ms.max(0.0) / 1e3);
-                locked(&status.changing).ages.observe(age);
+                locked(&status.changing).counts.ages.observe(age);
             }
         }
     }
@@ -80,14 +80,15 @@ impl VehicleStatus {
         self.health_state.send_if_modified(|last| std::mem::replace(last, state) != state);
         drop(health);
         let changing = locked(&self.changing);
-        let by_clock_ms = now_ns().saturating_sub(changing.newest_capture_end_ns) as f64 / 1e6;
+        let by_clock_ms = now_ns().saturating_sub(changing.counts.newest_capture_end_ns) as f64 / 1e6;
         // The stamp of a recorded map says nothing about now.
         let by_arrival_ms = facts.map_age.filter(|_| changing.has_recorded_stamps).map(|age| age.as_secs_f64() * 1e3);
-        let is_made = changing.maps > 0 && self.started.elapsed().saturating_sub(changing.mapped_at) <= SILENT_AFTER;
+        let is_made =
+            changing.counts.maps > 0 && self.started.elapsed().saturating_sub(changing.mapped_at) <= SILENT_AFTER;
         Assessment {
             state,
             reasons,
-            map_age_ms: (changing.maps > 0).then_some(by_arrival_ms.unwrap_or(by_clock_ms)),
+            map_age_ms: (changing.counts.maps > 0).then_some(by_arrival_ms.unwrap_or(by_clock_ms)),
             loss: facts.loss,
             speed_m_s: changing.speed_m_s.filter(|_| is_made),
             claimed_by: facts.claimed_by,
@@ -111,7 +112,7 @@ impl VehicleStatus {
         let claimed_by = self.claimed_by();
         let mut changing = locked(&self.changing);
         let up = self.started.elapsed();
-        let mut sensors = changing.sensors.clone();
+        let mut sensors = changing.counts.sensors.clone();
         let mut of_vehicle = clearway_mapping::ledger::Ledger::default();
         let ledgers = sensors.iter_mut().map(|sensor| (sensor.source, &mut sensor.ledger));
         self.drops.add_unreported_to(&mut of_vehicle, ledgers);
@@ -119,20 +120,20 @@ impl VehicleStatus {
         let loss = changing.window.loss(counts);
         changing.window.push_counts(up, counts);
         let since_mapped = up.saturating_sub(changing.mapped_at);
-        let by_clock = now_ns().saturating_sub(changing.newest_capture_end_ns);
+        let by_clock = now_ns().saturating_sub(changing.counts.newest_capture_end_ns);
         let map_ahead = Duration::from_nanos(u64::try_from(by_clock.saturating_neg()).unwrap_or(0));
         let by_clock = Duration::from_nanos(u64::try_from(by_clock).unwrap_or(0));
         // As in a client: no step of a clock makes an old map look young.
         let age = if changing.has_recorded_stamps { since_mapped } else { by_clock.max(since_mapped) };
         let senders = |source| self.drops.senders.at_once(source, Instant::now());
         let of_sensors =
-            changing.sensors.iter().map(|sensor| sensor_facts(sensor, senders(sensor.source), &changing, up));
+            changing.counts.sensors.iter().map(|sensor| sensor_facts(sensor, senders(sensor.source), &changing, up));
         let sensors = of_sensors.collect();
         Facts {
             fault: self.fault(),
             up,
             makes_maps: !self.layers.is_empty(),
-            map_age: (changing.maps > 0).then_some(age),
+            map_age: (changing.counts.maps > 0).then_some(age),
             map_ahead: if changing.has_recorded_stamps { Duration::ZERO } else { map_ahead },
             not_fresh_for: up.saturating_sub(changing.fresh_at),
             validity: changing.validity,

@@ -73,16 +73,13 @@ pub struct VehicleStatus {
 /// What the engine changes.
 #[derive(Debug, Default)]
 pub(super) struct Changing {
-    ledger: Ledger,
-    refusals: BTreeMap<&'static str, String>,
-    pub(super) sensors: Vec<NamedStatus>,
+    /// The counts, without the values that [`VehicleStatus::snapshot`] computes.
+    pub(super) counts: Snapshot,
     /// When something of each sensor arrived and could be read, by name.
     pub(super) seen: BTreeMap<String, Seen>,
     pub(super) pose: Option<v1::VehiclePose>,
     notices: Notices,
     pub(super) states: Vec<v1::SensorState>,
-    pub(super) maps: u64,
-    pub(super) newest_capture_end_ns: i64,
     /// Publication of the newest map, after `started`.
     pub(super) mapped_at: Duration,
     /// Publication of the newest map that was fresh then, after `started`.
@@ -94,12 +91,7 @@ pub(super) struct Changing {
     pub(super) replay: Option<(v1::ReplayPhase, Duration)>,
     /// What the replay waits for in lockstep; empty: nothing.
     pub(super) replay_awaited: String,
-    drivable_share: Option<f64>,
     pub(super) window: Window,
-    /// Time of all maps by stage, in the order of [`StageTimes::NAMES`].
-    pub(super) stages: [Histogram; StageTimes::NAMES.len()],
-    /// Age of the newest map, sampled at each assessment.
-    pub(super) ages: Histogram,
     /// Time to step and encode each of the newest maps, in ns.
     latencies_ns: VecDeque<u64>,
 }
@@ -331,7 +323,7 @@ impl VehicleStatus {
     pub(crate) fn stepped(&self, ledger: &Ledger, sensors: Vec<NamedStatus>, pose: Option<v1::VehiclePose>) {
         let mut state = locked(&self.changing);
         let now = self.started.elapsed();
-        state.ledger.clone_from(ledger);
+        state.counts.ledger.clone_from(ledger);
         state.notices.update(&self.name, &sensors);
         for NamedStatus { name, ledger, .. } in &sensors {
             let (received, read) = (ledger.received, ledger.decoded + ledger.telemetry);
@@ -344,12 +336,12 @@ impl VehicleStatus {
             }
             (seen.received, seen.read) = (received, read);
         }
-        (state.sensors, state.pose) = (sensors, pose);
+        (state.counts.sensors, state.pose) = (sensors, pose);
     }
 
     /// Keeps the words of a refusal, if it is the first for its reason.
     pub(crate) fn note_refusal(&self, error: &EventError) {
-        locked(&self.changing).refusals.entry(error.reason()).or_insert_with(|| error.to_string());
+        locked(&self.changing).counts.refusals.entry(error.reason()).or_insert_with(|| error.to_string());
     }
 
     /// Records a new map and the time it took.
@@ -359,15 +351,16 @@ impl VehicleStatus {
         let mut state = locked(&self.changing);
         state.states = states;
         // A jump of a replay sets the number back.
-        state.maps = map.sequence + 1;
-        (state.newest_capture_end_ns, state.drivable_share) = (map.capture_end_ns, map.drivable_share);
+        state.counts.maps = map.sequence + 1;
+        state.counts.newest_capture_end_ns = map.capture_end_ns;
+        state.counts.drivable_share = map.drivable_share;
         let at = self.started.elapsed();
         (state.mapped_at, state.validity, state.speed_m_s) = (at, validity, speed_m_s);
         state.has_recorded_stamps = !is_shifted && self.is_from_files.load(Ordering::Relaxed);
         let age = Duration::from_nanos(now_ns().abs_diff(map.capture_end_ns));
         state.fresh_at = if state.has_recorded_stamps || age <= validity { at } else { state.fresh_at };
         state.window.push_map(at, stages, map.bytes());
-        for (histogram, time) in state.stages.iter_mut().zip(stages.in_order()) {
+        for (histogram, time) in state.counts.stages.iter_mut().zip(stages.in_order()) {
             time.into_iter().for_each(|time| histogram.observe(time));
         }
         let latency = stages.map.unwrap_or_default() + stages.encode.unwrap_or_default();
@@ -383,18 +376,10 @@ impl VehicleStatus {
         let mut latencies: Vec<u64> = state.latencies_ns.iter().copied().collect();
         let now = self.started.elapsed();
         let mut snapshot = Snapshot {
-            ledger: state.ledger.clone(),
-            refusals: state.refusals.clone(),
-            sensors: state.sensors.clone(),
-            maps: state.maps,
-            newest_capture_end_ns: state.newest_capture_end_ns,
-            drivable_share: state.drivable_share,
             latency_ms: state.window.latency_ms(now),
             map_rate_hz: state.window.map_rate_hz(now),
             map_bytes: state.window.map_bytes(now),
-            stages: state.stages.clone(),
-            ages: state.ages.clone(),
-            ..Snapshot::default()
+            ..state.counts.clone()
         };
         let sensors = snapshot.sensors.iter_mut().map(|sensor| (sensor.source, &mut sensor.ledger));
         self.drops.add_unreported_to(&mut snapshot.ledger, sensors);

@@ -33,7 +33,7 @@ mod part;
 mod recording;
 
 pub use control::{Command, ControlError, RecorderControl};
-pub use counts::{IncompleteRecordingError, RecorderCounts, RecorderState};
+pub use counts::{IncompleteRecordingError, RecorderCounts};
 pub use folder::{
     Files, Folder, RecordError, confirmation_of, is_being_written, is_same_file, later_part_of, next_free_name,
     parent_of, parts_of, recording_path, unfinished_name,

@@ -38,7 +38,7 @@ impl<D: Disk> Part<D> {
 
     /// What the part holds and lacks.
     pub(super) fn counts(&self, counts: &RecorderCounts, reason: &str, closed: bool) -> v1::RecordingCounts {
-        let topics = counts.topics().zip(&self.topics).map(|(topic, (written, dropped))| v1::TopicCount {
+        let topics = counts.topics().iter().zip(&self.topics).map(|(topic, (written, dropped))| v1::TopicCount {
             topic: topic.to_owned(),
             offered: written + dropped,
             written: *written,
