@@ -21,7 +21,6 @@ use axum::routing::get;
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
 use bytes::{BufMut, Bytes, BytesMut};
-use clearway_client::MapView;
 use foxglove::messages::{FrameTransforms, Grid, Log, PointCloud, SceneUpdate};
 use foxglove::{Encode, Schema};
 use serde::Deserialize;
@@ -35,7 +34,7 @@ use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
 use crate::base::token_bucket::TokenBucket;
 use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
+use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths, view};
 use crate::engine::newest::NewestSweep;
 use crate::engine::subscriptions::LayerSubscription;
 use crate::status::{Reader, Transport};
@@ -268,13 +267,6 @@ fn publish(channel: &Channel, map: &EncodedMap, sweep: &NewestSweep, rasters: &m
             }
         }
     }
-}
-
-/// The decoded `bytes` of `map`.
-fn view(map: &EncodedMap, bytes: Bytes) -> Option<MapView> {
-    MapView::decode(bytes)
-        .inspect_err(|error| tracing::error!(vehicle = %map.vehicle, %error, "foxglove: a map cannot be decoded"))
-        .ok()
 }
 
 async fn connect(

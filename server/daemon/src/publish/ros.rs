@@ -13,8 +13,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
 use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{ros, safe_paths};
-use bytes::Bytes;
+use crate::encode::viewer::{ros, safe_paths, view};
 use clearway_client::Layer;
 use clearway_client::MapView;
 use clearway_ros::cdr::Writer;
@@ -75,7 +74,7 @@ impl<'a> Node<'a> {
         }
         let tf = self.topic("/tf", &TF_MESSAGE, MOVING).await?;
         let transform = |map: &EncodedMap| {
-            let map = decode(map, map.header.clone())?;
+            let map = view(map, map.header.clone())?;
             ros::tf(&map)
         };
         tasks.spawn(tf.publish(served.clone(), None, transform));
@@ -96,7 +95,7 @@ impl<'a> Node<'a> {
         let topic = self.topic(topic, kind, LATCHED).await?;
         let message = move |map: &EncodedMap| {
             let (_, chunk) = map.layers.iter().find(|(name, _)| *name == layer)?;
-            let map = decode(map, map.layer(chunk))?;
+            let map = view(map, map.layer(chunk))?;
             let layer = map.layers().first()?;
             Some(write(&map, layer))
         };
@@ -148,13 +147,6 @@ fn gid(token: &str) -> [u8; 16] {
     gid[..8].copy_from_slice(&half(0));
     gid[8..].copy_from_slice(&half(1));
     gid
-}
-
-/// The decoded `bytes` of `map`.
-fn decode(map: &EncodedMap, bytes: Bytes) -> Option<MapView> {
-    MapView::decode(bytes)
-        .inspect_err(|error| tracing::error!(vehicle = %map.vehicle, %error, "ros: a map cannot be decoded"))
-        .ok()
 }
 
 /// The publisher of one topic.

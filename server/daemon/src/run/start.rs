@@ -177,22 +177,9 @@ impl Running {
             self.start_zenoh(config, &gateways, listeners.grpc_address(), settings, session).await?;
         }
         if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
-            let (rules, stopped) =
-                (save_rules::watch(config.clone(), self.vehicles.clone(), recorder.control()), self.stopped());
-            self.publishers.spawn(async move {
-                tokio::select! {
-                    () = rules => {}
-                    () = stopped => {}
-                }
-            });
+            self.spawn_until_stopped(save_rules::watch(config.clone(), self.vehicles.clone(), recorder.control()));
         }
-        let (states, stopped) = (watch_states(self.vehicles.statuses()), self.stopped());
-        self.publishers.spawn(async move {
-            tokio::select! {
-                () = states => {}
-                () = stopped => {}
-            }
-        });
+        self.spawn_until_stopped(watch_states(self.vehicles.statuses()));
         self.serve(listeners, gateways);
         self.start_udp(sockets)
     }
@@ -279,6 +266,17 @@ impl Running {
             self.engines.push((name, thread));
         }
         Ok(())
+    }
+
+    /// Works beside the publishers until the server stops.
+    fn spawn_until_stopped(&mut self, work: impl Future<Output = ()> + Send + 'static) {
+        let stopped = self.stopped();
+        self.publishers.spawn(async move {
+            tokio::select! {
+                () = work => {}
+                () = stopped => {}
+            }
+        });
     }
 
     /// The gateways of the vehicles that allow observations.

@@ -17,5 +17,16 @@ pub mod raster;
 pub mod ros;
 pub mod safe_paths;
 
+use bytes::Bytes;
+use clearway_client::MapView;
+use clearway_journal::encode::EncodedMap;
+
 pub use frame::base_frame;
 pub use raster::Raster;
+
+/// The decoded `bytes` of `map`; `None`, and an error in the log, if they cannot be decoded.
+pub fn view(map: &EncodedMap, bytes: Bytes) -> Option<MapView> {
+    MapView::decode(bytes)
+        .inspect_err(|error| tracing::error!(vehicle = %map.vehicle, %error, "a map cannot be decoded"))
+        .ok()
+}
