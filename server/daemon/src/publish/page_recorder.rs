@@ -5,6 +5,7 @@
 //! the state after it, the files that were saved, and `error`. Operators get one without asking when they connect, so a
 //! page that has none shows no buttons.
 
+use clearway_proto::v1;
 use serde::Deserialize;
 use serde_json::json;
 
@@ -41,7 +42,7 @@ impl PageRecorder {
 
     /// The state of the recorder.
     pub fn state(&self) -> String {
-        answer(&self.0, &[], "")
+        answer(self.0.status(), "")
     }
 
     /// Carries out a request, and answers it.
@@ -55,21 +56,15 @@ impl PageRecorder {
         let control = self.0.clone();
         async move {
             match control.send(command).await {
-                Ok(files) => {
-                    let files: Vec<_> = files.iter().map(|file| file.display().to_string()).collect();
-                    answer(&control, &files, "")
-                }
-                Err(error) => answer(&control, &[], &error.to_string()),
+                Ok(response) => answer(response, ""),
+                Err(error) => answer(control.status(), &error.to_string()),
             }
         }
     }
 }
 
-fn answer(control: &RecorderControl, files: &[String], error: &str) -> String {
-    let status = control.status();
-    json!({
-        "type": "recorder", "state": status.state, "file": status.file, "part": status.part,
-        "files": files, "error": error,
-    })
-    .to_string()
+fn answer(v1::RecordingResponse { status, files }: v1::RecordingResponse, error: &str) -> String {
+    let v1::RecorderStatus { state, file, part, .. } = status.unwrap_or_default();
+    json!({ "type": "recorder", "state": state, "file": file, "part": part, "files": files, "error": error })
+        .to_string()
 }

@@ -96,11 +96,9 @@ async fn answer(
         let parts = tokio::task::spawn_blocking(move || listing.list()).await.map_err(|error| error.to_string())?;
         return Ok(("clearway.v1.ListRecordingsResponse", v1::ListRecordingsResponse { parts }.encode_to_vec()));
     }
-    let files = match command {
+    let response = match command {
         Some(command) => control.send(command).await.map_err(|error| error.to_string())?,
-        None => Vec::new(),
+        None => control.status(),
     };
-    let files = files.iter().map(|file| file.display().to_string()).collect();
-    let response = v1::RecordingResponse { status: Some(control.status()), files };
     Ok(("clearway.v1.RecordingResponse", response.encode_to_vec()))
 }

@@ -105,7 +105,7 @@ async fn report_health(health: HealthReporter, vehicles: Vehicles, recorder: Opt
         } else {
             health.set_not_serving::<MapServiceServer<Maps>>().await;
         }
-        match recorder.as_ref().map(|recorder| recorder.status().reason.is_empty()) {
+        match recorder.as_ref().map(|recorder| recorder.status().status.is_none_or(|of| of.reason.is_empty())) {
             Some(true) => health.set_serving::<RecordingServiceServer<Recordings>>().await,
             Some(false) => health.set_not_serving::<RecordingServiceServer<Recordings>>().await,
             None => {}

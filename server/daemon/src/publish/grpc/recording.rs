@@ -13,10 +13,7 @@ pub(super) struct Recordings {
 
 impl Recordings {
     async fn send(&self, command: Command) -> Result<Response<v1::RecordingResponse>, Status> {
-        let control = self.control()?;
-        let files = control.send(command).await.map_err(|error| status(&error))?;
-        let files = files.iter().map(|file| file.display().to_string()).collect();
-        Ok(Response::new(v1::RecordingResponse { status: Some(control.status()), files }))
+        self.control()?.send(command).await.map(Response::new).map_err(|error| status(&error))
     }
 
     fn control(&self) -> Result<&RecorderControl, Status> {
@@ -61,7 +58,6 @@ impl RecordingService for Recordings {
     }
 
     async fn status(&self, _: Request<v1::RecordingStatusRequest>) -> Answer<v1::RecordingResponse> {
-        let status = Some(self.control()?.status());
-        Ok(Response::new(v1::RecordingResponse { status, files: Vec::new() }))
+        Ok(Response::new(self.control()?.status()))
     }
 }

@@ -61,12 +61,12 @@ pub struct RecorderControl {
 }
 
 impl RecorderControl {
-    /// Sends a request and waits for what it has done: the files that were saved.
+    /// Sends a request and waits for what it has done: the state after it, and the files that were saved.
     ///
     /// # Errors
     /// [`ControlError::Reason`] if the reason of a save is not allowed, [`ControlError::Refused`] if the recorder
     /// cannot do it now, [`ControlError::NoAnswer`] if it has ended.
-    pub async fn send(&self, mut command: Command) -> Result<Vec<PathBuf>, ControlError> {
+    pub async fn send(&self, mut command: Command) -> Result<v1::RecordingResponse, ControlError> {
         if let Command::Save { reason, .. } = &mut command {
             if reason.is_empty() {
                 *reason = "request".to_owned();
@@ -77,7 +77,9 @@ impl RecorderControl {
         }
         let (answer, answered) = oneshot::channel();
         self.requests.send(Request { command, answer }).map_err(|_| ControlError::NoAnswer)?;
-        answered.await.map_err(|_| ControlError::NoAnswer)?.map_err(ControlError::Refused)
+        let files = answered.await.map_err(|_| ControlError::NoAnswer)?.map_err(ControlError::Refused)?;
+        let files = files.iter().map(|file| file.display().to_string()).collect();
+        Ok(v1::RecordingResponse { files, ..self.status() })
     }
 
     /// All parts on the disk, oldest first.
@@ -85,8 +87,8 @@ impl RecorderControl {
         Folder::of(&self.options).list()
     }
 
-    /// The state and the counts of the recorder.
-    pub fn status(&self) -> v1::RecorderStatus {
-        self.counts.to_proto()
+    /// The state and the counts of the recorder, without files.
+    pub fn status(&self) -> v1::RecordingResponse {
+        v1::RecordingResponse { status: Some(self.counts.to_proto()), files: Vec::new() }
     }
 }
