@@ -46,8 +46,14 @@ pub struct PlayerOptions {
     pub boot_id: u64,
 }
 
-/// The client or the user wants the replay to end.
-struct Stopped;
+/// Why the player leaves its loop before the end.
+#[derive(Debug, thiserror::Error)]
+enum Interrupt {
+    #[error("stopped")]
+    Stopped,
+    #[error(transparent)]
+    Failed(#[from] PlayError),
+}
 
 /// A map that readers have to acknowledge before the replay goes on.
 #[derive(Clone, Copy)]
@@ -120,18 +126,17 @@ impl Player {
     /// # Errors
     /// [`PlayError`].
     pub fn run(mut self) -> Result<Played, PlayError> {
-        let played = match self.play()? {
+        let reached_end = match self.play() {
             Ok(()) => true,
-            Err(Stopped) => self.state.phase() == ReplayPhase::Ended,
+            Err(Interrupt::Stopped) => self.state.phase() == ReplayPhase::Ended,
+            Err(Interrupt::Failed(error)) => return Err(error),
         };
         let remarks = self.readings.end().map(std::mem::take).unwrap_or_default();
-        Ok(Played { reached_end: played, behind_max: self.behind_max, remarks })
+        Ok(Played { reached_end, behind_max: self.behind_max, remarks })
     }
 
-    fn play(&mut self) -> Result<Result<(), Stopped>, PlayError> {
-        if self.await_readers()?.is_err() {
-            return Ok(Err(Stopped));
-        }
+    fn play(&mut self) -> Result<(), Interrupt> {
+        self.await_readers()?;
         let first_ns = self.state.position_ns.max(self.state.from_ns);
         if first_ns > self.state.begin_ns {
             self.jump(first_ns, false)?;
@@ -140,29 +145,21 @@ impl Player {
             match self.state.phase() {
                 ReplayPhase::Playing if !self.is_acknowledged()? => {
                     self.clock.pause();
-                    if self.wait(Instant::now())?.is_err() {
-                        return Ok(Err(Stopped));
-                    }
+                    self.wait(Instant::now())?;
                     self.step_waiting(None);
                 }
-                ReplayPhase::Playing => match self.readings.next_ns()? {
-                    Some(at_ns) if at_ns <= self.state.to_ns => {
-                        if self.wait_for(at_ns)?.is_err() {
-                            return Ok(Err(Stopped));
-                        }
-                    }
+                ReplayPhase::Playing => match self.readings.next_ns().map_err(PlayError::from)? {
+                    Some(at_ns) if at_ns <= self.state.to_ns => self.wait_for(at_ns)?,
                     _ => self.end()?,
                 },
-                ReplayPhase::Ended if !self.options.is_served => return Ok(Ok(())),
+                ReplayPhase::Ended if !self.options.is_served => return Ok(()),
                 ReplayPhase::Ended if self.options.exits_at_end => {
                     self.let_readers_leave();
-                    return Ok(Ok(()));
+                    return Ok(());
                 }
                 _ => {
                     self.clock.pause();
-                    if self.wait(Instant::now() + POLL)?.is_err() {
-                        return Ok(Err(Stopped));
-                    }
+                    self.wait(Instant::now() + POLL)?;
                     self.step_waiting(None);
                 }
             }
@@ -170,22 +167,22 @@ impl Player {
     }
 
     /// Waits until as many readers are there as the state demands.
-    fn await_readers(&mut self) -> Result<Result<(), Stopped>, PlayError> {
+    fn await_readers(&mut self) -> Result<(), Interrupt> {
         while self.state.phase() == ReplayPhase::Waiting {
             let readers: u32 = self.vehicles.iter().map(|vehicle| vehicle.engine.status.readers_sum()).sum();
             if readers >= self.state.readers_awaited {
                 self.state.readers_awaited = 0;
                 let paused = self.options.begins_paused;
                 self.set_phase(if paused { ReplayPhase::Paused } else { ReplayPhase::Playing });
-            } else if self.wait(Instant::now() + POLL)?.is_err() {
-                return Ok(Err(Stopped));
+            } else {
+                self.wait(Instant::now() + POLL)?;
             }
         }
-        Ok(Ok(()))
+        Ok(())
     }
 
     /// Steps the next reading, of recorded time `at_ns`, when it is due, unless a command comes before.
-    fn wait_for(&mut self, at_ns: i64) -> Result<Result<(), Stopped>, PlayError> {
+    fn wait_for(&mut self, at_ns: i64) -> Result<(), Interrupt> {
         if self.step.is_some() {
             // A step is as fast as possible, and its stamps are those of the present.
             self.clock.restart(None);
@@ -198,13 +195,12 @@ impl Player {
         if left > EXACT || has_command {
             // The last part is slept exactly.
             let until = Instant::now() + left.saturating_sub(EXACT / 2).min(POLL);
-            let stopped = self.wait(until)?;
+            let waited = self.wait(until);
             self.step_waiting(None);
-            return Ok(stopped);
+            return waited;
         }
         std::thread::sleep(left);
-        self.take_next()?;
-        Ok(Ok(()))
+        Ok(self.take_next()?)
     }
 
     /// Remembers the greatest delay, and logs once that there is one.
@@ -216,7 +212,7 @@ impl Player {
     }
 
     /// Waits for one command until a time, and applies it.
-    fn wait(&mut self, until: Instant) -> Result<Result<(), Stopped>, PlayError> {
+    fn wait(&mut self, until: Instant) -> Result<(), Interrupt> {
         let commands = &mut self.input.commands;
         let command = self.runtime.block_on(async {
             tokio::select! {
@@ -235,9 +231,9 @@ impl Player {
                     (changed, _) => _ = outcome.send(changed.map(|()| self.state.clone())),
                 }
             }
-            Some(Some(Command::Stop) | None) => return Ok(Err(Stopped)),
+            Some(Some(Command::Stop) | None) => return Err(Interrupt::Stopped),
         }
-        Ok(Ok(()))
+        Ok(())
     }
 
     /// Takes the next reading and steps its vehicle.
