@@ -87,13 +87,19 @@ fn map(numbers: &mut Numbers) -> Bytes {
         ("squares", squares(0.0), 24, 32),
         ("rings", Geometry::Radial(rings), 10, 36),
     ];
+    let mut drawn = Numbers(SEED + 1);
     let mut encoded = encode_header(&v1::Header::default()).to_vec();
     for (name, geometry, rows, columns) in layers {
         let classes = blots(numbers, rows, columns);
+        // Reasons of which the last one is none that the clients know.
+        let reasons: Vec<u8> = (0..classes.len()).map(|_| (drawn.unit() * 10.0) as u8).collect();
+        let channel =
+            |name: &str, cells: &[u8]| encode_grid(CellsRef::U8(cells), columns).into_channel(name, "", 1.0, 0);
+        let why = (name == "squares").then(|| channel("why", &reasons));
         let mut layer = v1::Layer {
             name: name.into(),
             geometry: Some(geometry),
-            channels: vec![encode_grid(CellsRef::U8(&classes), columns).into_channel("class", "", 1.0, 0)],
+            channels: [channel("class", &classes)].into_iter().chain(why).collect(),
             ..Default::default()
         };
         encode_legend(&mut layer, LEGEND);

@@ -178,7 +178,9 @@ class Layer:
     @property
     def _asked(self) -> Asked:
         kinds = {Meaning.FREE: FREE, Meaning.LOW: LOW}
-        return Asked(self.grid, self.classes, self.legend, [kinds.get(e.meaning, BLOCKS) for e in self.legend_entries])
+        by_class = [kinds.get(entry.meaning, BLOCKS) for entry in self.legend_entries]
+        why = self.channels["why"].raw if "why" in self.channels else None
+        return Asked(self.grid, self.classes, self.legend, by_class, why)
 
     def _of_classes(self, meaning: Meaning) -> np.ndarray:
         return np.array([entry.meaning == meaning for entry in self.legend_entries])

@@ -23,6 +23,8 @@ from .shapes import Arc, Outline, Point, corners_of, finite, length, poses_of
 _TOUCH_M = 1e-9
 #: What a class is to a vehicle that drives onto it.
 FREE, LOW, BLOCKS = 0, 1, 2
+#: Names of the values of the channel `why` of the layer `freespace`.
+_REASONS = ("not seen", "seen", "bridged", "remembered", "step", "obstacle", "overhang", "ditch", "too narrow")
 
 
 class Blocker(NamedTuple):
@@ -75,7 +77,10 @@ class Obstacle(NamedTuple):
 class Asked:
     """One layer as questions see it."""
 
-    def __init__(self, grid: Grid, classes: np.ndarray, names: Sequence[str], kinds: Sequence[int], why=None) -> None:
+    def __init__(
+        self, grid: Grid, classes: np.ndarray, names: Sequence[str], kinds: Sequence[int], why: np.ndarray | None
+    ) -> None:
+        """`kinds`: FREE, LOW or BLOCKS for each class. `why`: the raw values of the channel `why`, if there is one."""
         self._grid, self._classes, self._names, self._why = grid, classes.ravel(), names, why
         self._kinds = np.array([*kinds], dtype=np.int64)
 
@@ -145,8 +150,13 @@ class Asked:
         micrometres = np.floor(np.hypot(centres[:, 0] - start[0], centres[:, 1] - start[1]) * 1e6 + 0.5)
         first = int(micrometres.argmin())
         cell = int(cells[first])
-        why = None if self._why is None else self._why(cell)
-        return Blocker(*map(float, centres[first]), self._names[self._classes[cell]], why)
+        return Blocker(*map(float, centres[first]), self._names[self._classes[cell]], self._reason(cell))
+
+    def _reason(self, cell: int) -> str | None:
+        if self._why is None:
+            return None
+        raw = int(self._why.flat[cell])
+        return _REASONS[raw] if 0 <= raw < len(_REASONS) else f"reason {raw}"
 
 
 def touched(grid: Grid, corners: list[Point]) -> tuple[np.ndarray, Point | None]:

@@ -6,7 +6,7 @@
 
 use clearway_proto::grid::Grid;
 
-use super::{Kind, class_of, kinds};
+use super::{ClassKind, class_of, kinds};
 use crate::error::ClientError;
 use crate::view::MapView;
 
@@ -42,9 +42,9 @@ impl MapView {
         let (width, height) = (width as usize, height as usize);
         let kinds = kinds(layer);
         let is_free = |cell: usize| match class_of(layer, cell).map(|class| kinds[class]) {
-            Some(Kind::Free) => true,
-            Some(Kind::Low) => passes_low,
-            Some(Kind::Blocks) | None => false,
+            Some(ClassKind::Free) => true,
+            Some(ClassKind::Low) => passes_low,
+            Some(ClassKind::Blocks) | None => false,
         };
         let reach = (most_m / f64::from(cell_m) + 0.5).ceil().min((width + height) as f64) as u32;
         let down = steps_down(width, height, reach, is_free);

@@ -139,7 +139,9 @@ impl MapView {
         point_m: [f64; 2],
         own: Option<&Outline>,
     ) -> Result<Option<Obstacle>, ClientError> {
-        self.nearest(layer, point_m, own, |class| class.meaning == ClassMeaning::Occupied && kind(class) != Kind::Low)
+        self.nearest(layer, point_m, own, |class| {
+            class.meaning == ClassMeaning::Occupied && kind(class) != ClassKind::Low
+        })
     }
 
     /// The low thing that is nearest to a point, as [`MapView::nearest_obstacle`].
@@ -152,7 +154,7 @@ impl MapView {
         point_m: [f64; 2],
         own: Option<&Outline>,
     ) -> Result<Option<Obstacle>, ClientError> {
-        self.nearest(layer, point_m, own, |class| kind(class) == Kind::Low)
+        self.nearest(layer, point_m, own, |class| kind(class) == ClassKind::Low)
     }
 
     fn nearest(
@@ -187,22 +189,22 @@ impl MapView {
 
 /// What a class is to a vehicle that drives onto it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+enum ClassKind {
     Free,
     Low,
     Blocks,
 }
 
-fn kind(class: &Class) -> Kind {
+fn kind(class: &Class) -> ClassKind {
     match class.meaning {
-        ClassMeaning::Free => Kind::Free,
-        ClassMeaning::Low => Kind::Low,
-        _ => Kind::Blocks,
+        ClassMeaning::Free => ClassKind::Free,
+        ClassMeaning::Low => ClassKind::Low,
+        _ => ClassKind::Blocks,
     }
 }
 
 /// The kinds of a layer's classes, by value.
-fn kinds(layer: &Layer) -> Vec<Kind> {
+fn kinds(layer: &Layer) -> Vec<ClassKind> {
     layer.legend.iter().map(kind).collect()
 }
 
@@ -217,11 +219,12 @@ fn class_name(layer: &Layer, cell: usize) -> String {
 }
 
 /// The answer for a polygon; of several cells that forbid it, the one nearest to `from` is named.
-fn answer(layer: &Layer, kinds: &[Kind], corners: &[[f64; 2]], from: [f64; 2]) -> Answer {
+fn answer(layer: &Layer, kinds: &[ClassKind], corners: &[[f64; 2]], from: [f64; 2]) -> Answer {
     let Touched { cells, outside } = touched(&layer.grid, corners);
-    let nearest = |wanted: Kind| {
-        let of_kind =
-            cells.iter().filter(|cell| class_of(layer, **cell).map_or(Kind::Blocks, |class| kinds[class]) == wanted);
+    let nearest = |wanted: ClassKind| {
+        let of_kind = cells
+            .iter()
+            .filter(|cell| class_of(layer, **cell).map_or(ClassKind::Blocks, |class| kinds[class]) == wanted);
         let with_distance = of_kind.filter_map(|cell| {
             let (x, y) = layer.grid.centre_of(*cell)?;
             // To a micrometre, so that equal distances are equal in every client.
@@ -231,18 +234,24 @@ fn answer(layer: &Layer, kinds: &[Kind], corners: &[[f64; 2]], from: [f64; 2]) -
         let (_, cell, [x_m, y_m]) = with_distance.min_by_key(|(distance_um, cell, _)| (*distance_um, *cell))?;
         Some(Blocker { x_m, y_m, class: class_name(layer, cell), why: why_of(layer, cell) })
     };
-    if let Some(blocker) = nearest(Kind::Blocks) {
+    if let Some(blocker) = nearest(ClassKind::Blocks) {
         return Answer::Blocked(blocker);
     }
     if let Some([x_m, y_m]) = outside {
         return Answer::Blocked(Blocker { x_m, y_m, class: "unknown".into(), why: Some("outside of the map".into()) });
     }
-    nearest(Kind::Low).map_or(Answer::Free, Answer::Low)
+    nearest(ClassKind::Low).map_or(Answer::Free, Answer::Low)
 }
 
+/// Names of the values of the channel `why` of the layer `freespace`.
+const REASONS: [&str; 9] =
+    ["not seen", "seen", "bridged", "remembered", "step", "obstacle", "overhang", "ditch", "too narrow"];
+
 /// The name of a cell's reason in the channel `why`; `None` if the layer has no such channel.
-fn why_of(_layer: &Layer, _cell: usize) -> Option<String> {
-    None
+fn why_of(layer: &Layer, cell: usize) -> Option<String> {
+    let raw = layer.channel("why")?.cells.get(cell)?;
+    let name = usize::try_from(raw).ok().and_then(|raw| REASONS.get(raw));
+    Some(name.map_or_else(|| format!("reason {raw}"), |name| (*name).to_owned()))
 }
 /// The place in a cell that is nearest to a point, ego frame.
 fn nearest_in(grid: &Grid, cell: usize, [x, y]: [f64; 2]) -> [f64; 2] {

@@ -45,7 +45,7 @@ pub struct KnownPlace {
 
 /// What a point is to a footprint.
 #[derive(Clone, Copy, PartialEq)]
-enum Role {
+enum PointRole {
     Ground,
     /// Ground on which no vehicle may stand: too steep, or not to be reached.
     Barred,
@@ -99,11 +99,11 @@ impl FreeGround {
 
     /// The squares that ground returns prove, before anything is taken away.
     fn cover(&mut self, points: &[JudgedPoint], sensor_m: [f32; 2]) -> Vec<bool> {
-        let mut columns: Vec<Vec<(f32, f32, Role)>> = vec![Vec::new(); COLUMNS];
+        let mut columns: Vec<Vec<(f32, f32, PointRole)>> = vec![Vec::new(); COLUMNS];
         for (point, role) in points.iter().filter_map(|point| Some((point, role(point)?))) {
             let (x, y) = (point.place[0] - sensor_m[0], point.place[1] - sensor_m[1]);
             columns[column(x, y)].push((x.hypot(y), point.place[2], role));
-            if let (Role::Ground, Some(square)) = (role, square(point.place[0], point.place[1])) {
+            if let (PointRole::Ground, Some(square)) = (role, square(point.place[0], point.place[1])) {
                 self.heights[square].0 += point.place[2];
                 self.heights[square].1 += 1;
                 self.paved[square] |= match point.class {
@@ -129,9 +129,9 @@ impl FreeGround {
         for (point, role) in points.iter().filter_map(|point| Some((point, role(point)?))) {
             let place = [point.place[0], point.place[1]];
             match role {
-                Role::Ground => {}
-                Role::Barred => self.block_about(place, 0.0),
-                Role::Thing => self.block_about(place, MARGIN_M),
+                PointRole::Ground => {}
+                PointRole::Barred => self.block_about(place, 0.0),
+                PointRole::Thing => self.block_about(place, MARGIN_M),
             }
         }
         for KnownPlace { place, vote } in known {
@@ -195,31 +195,31 @@ impl FreeGround {
 /// Greatest spread of heights over a plane that is one level, in metres: less than a kerb, more than noise.
 const LEVEL_M_MAX: f64 = 0.12;
 
-fn role(point: &JudgedPoint) -> Option<Role> {
+fn role(point: &JudgedPoint) -> Option<PointRole> {
     let (over, is_ground) = (point.over_m, point.ground[0] == Scored::Ground);
     match point.vote {
         _ if is_own([point.place[0], point.place[1]]) && !is_ground => None,
-        Vote::Steep | Vote::Forbidden => Some(Role::Barred),
-        Vote::Drivable | Vote::Either if is_ground => Some(Role::Ground),
-        Vote::Seen | Vote::Obstacle => Some(Role::Thing),
+        Vote::Steep | Vote::Forbidden => Some(PointRole::Barred),
+        Vote::Drivable | Vote::Either if is_ground => Some(PointRole::Ground),
+        Vote::Seen | Vote::Obstacle => Some(PointRole::Thing),
         // A point without a label or a class, or above simulated ground.
-        _ => (over > UNLABELLED_M_MIN && over <= OBSTACLE_M_MAX).then_some(Role::Thing),
+        _ => (over > UNLABELLED_M_MIN && over <= OBSTACLE_M_MAX).then_some(PointRole::Thing),
     }
 }
 
 /// The steps of one column that returns on ground prove.
-fn proven_steps(mut returns: Vec<(f32, f32, Role)>) -> Vec<bool> {
+fn proven_steps(mut returns: Vec<(f32, f32, PointRole)>) -> Vec<bool> {
     let mut proven = vec![false; STEPS];
     returns.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut prove = |from: f32, to: f32| {
         let last = ((to / STEP_M) as usize).min(STEPS - 1);
         proven[((from / STEP_M) as usize).min(last)..=last].fill(true);
     };
-    if let Some((range, _, Role::Ground)) = returns.first().filter(|first| first.0 <= BLIND_M_MAX) {
+    if let Some((range, _, PointRole::Ground)) = returns.first().filter(|first| first.0 <= BLIND_M_MAX) {
         prove(0.0, *range);
     }
     for pair in returns.windows(2) {
-        let [(from, low, Role::Ground), (to, high, Role::Ground)] = pair else { continue };
+        let [(from, low, PointRole::Ground), (to, high, PointRole::Ground)] = pair else { continue };
         let gap = to - from;
         if gap <= GAP_M_MAX && (high - low).abs() <= GAP_RISE.0 + GAP_RISE.1 * gap {
             prove(*from, *to);
