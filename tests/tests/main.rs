@@ -2,6 +2,7 @@
 //!
 //! | folder | what it tests |
 //! |---|---|
+//! | `drives` | bags, captures and scans with the faults that drivers and recorders have; other manufacturers |
 //! | `ingest` | what comes in: datagrams, observations, ROS 2, many sensors |
 //! | `readers` | what goes out: gRPC, zenoh, ROS 2, Foxglove, Python |
 //! | `listeners` | who may do what: certificates, roles, attacks |
@@ -13,6 +14,7 @@
 //! | `operation` | status, metrics, traces, packages, guides |
 //! | `repository` | the README's commands, and the rules that no compiler holds |
 
+mod drives;
 mod fixture;
 mod ingest;
 mod listeners;

@@ -20,7 +20,7 @@ pub fn message(bytes: &[u8]) {
     drop(Odometry::new(bytes));
     drop(pose_stamped(bytes));
     let mut frames = Frames::default();
-    for transform in tf_message(bytes).unwrap_or_default() {
+    for transform in tf_message(bytes).unwrap_or_default().transforms {
         frames.insert(&transform);
         frames.a_from_b("base_link", transform.child_frame_id);
     }

@@ -58,9 +58,21 @@ impl MessageError {
         }
     }
 
-    pub(crate) fn value(what: &'static str, value: impl ToString, allowed: &'static str) -> Self {
+    /// A value that is not allowed.
+    pub fn value(what: &'static str, value: impl ToString, allowed: &'static str) -> Self {
         Self::Value { what, value: value.to_string(), allowed }
     }
+}
+
+/// A part of a message that was refused while the rest of the message is used.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RefusedPart {
+    /// The kind of the part: `points`, `field`, `transforms`, `packets`, `twist`.
+    pub what: &'static str,
+    /// Number of points, transforms or packets; 1 for a field.
+    pub count: u64,
+    /// The first fault.
+    pub fault: MessageError,
 }
 
 /// `std_msgs/Header`.

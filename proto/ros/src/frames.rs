@@ -1,6 +1,6 @@
 //! Transforms -> pose of one frame in another: the tree of `/tf` and `/tf_static`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::Isometry3;
 
@@ -29,10 +29,9 @@ impl Frames {
         true
     }
 
-    /// True if the frame has a parent or a child.
-    pub fn contains(&self, frame: &str) -> bool {
-        let frame = name(frame);
-        self.parents.contains_key(frame) || self.parents.values().any(|(parent, _)| parent == frame)
+    /// All frames that have a parent or a child, in alphabetical order.
+    pub fn names(&self) -> BTreeSet<&str> {
+        self.parents.iter().flat_map(|(child, (parent, _))| [child.as_str(), parent]).collect()
     }
 
     /// Pose of frame `b` in frame `a`, which maps points of `b` to `a`; `None` if no chain of transforms joins them. It
@@ -68,4 +67,9 @@ impl Frames {
 /// Name of a frame without the leading slash that ROS 1 and some drivers write.
 pub fn name(frame_id: &str) -> &str {
     frame_id.strip_prefix('/').unwrap_or(frame_id)
+}
+
+/// Name of a frame without the namespace of its vehicle: `base_link` of `robot1/base_link`.
+pub fn local_name(frame_id: &str) -> &str {
+    frame_id.rsplit('/').next().unwrap_or(frame_id)
 }

@@ -1,8 +1,8 @@
 //! Poses: `nav_msgs/msg/Odometry`, `geometry_msgs/msg/PoseStamped`, `geometry_msgs/msg/PoseArray`,
 //! `tf2_msgs/msg/TFMessage`.
 //!
-//! In: the bytes of a message. Out: rigid transforms, each with the two frames it joins. A quaternion whose length is
-//! within 0.001 of 1 is normalised; any other is refused, such as the zeros of an unset message.
+//! In: the bytes of a message. Out: rigid transforms, each with the two frames it joins. As in tf2, a quaternion whose
+//! squared length is within 0.01 of 1 is normalised; any other is refused, such as the zeros of an unset message.
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
@@ -30,37 +30,64 @@ pub struct StampedTransform<'a> {
 pub struct Odometry<'a> {
     /// Pose of the vehicle.
     pub transform: StampedTransform<'a>,
+    /// Velocity; `None` if a number of it is not finite.
+    pub twist: Option<Twist>,
+}
+
+/// `geometry_msgs/msg/Twist`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Twist {
     /// Linear velocity in the child's frame, m/s.
     pub linear_mps: [f64; 3],
     /// Angular velocity in the child's frame, rad/s.
     pub angular_rps: [f64; 3],
 }
 
+/// The transforms of a `tf2_msgs/msg/TFMessage`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TfMessage<'a> {
+    /// The valid transforms, in the order of the message.
+    pub transforms: Vec<StampedTransform<'a>>,
+    /// The other transforms: tf2 ignores them too.
+    pub refused: Vec<RefusedTransform<'a>>,
+}
+
+/// A transform of a `tf2_msgs/msg/TFMessage` that was refused.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RefusedTransform<'a> {
+    /// Child frame.
+    pub child_frame_id: &'a str,
+    /// The fault, with the child frame.
+    pub fault: MessageError,
+}
+
 impl<'a> Odometry<'a> {
     /// Reads a message.
     ///
     /// # Errors
-    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if a number is not finite or a quaternion is not of
-    /// length 1.
+    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if a number of the pose is not finite or its quaternion
+    /// is not of length 1.
     pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
         let mut reader = Reader::new(message)?;
         let header = reader.header()?;
         let child_frame_id = reader.text("child_frame_id")?;
         let parent_from_child = pose(&mut reader, "pose.pose")?;
         reader.f64s::<36>("pose.covariance")?;
-        let linear_mps = finite(reader.f64s("twist.twist.linear")?, "twist.twist.linear")?;
-        let angular_rps = finite(reader.f64s("twist.twist.angular")?, "twist.twist.angular")?;
+        let (linear_mps, angular_rps) = (reader.f64s("twist.twist.linear")?, reader.f64s("twist.twist.angular")?);
         reader.f64s::<36>("twist.covariance")?;
         let transform = StampedTransform { header, child_frame_id, parent_from_child };
-        Ok(Self { transform, linear_mps, angular_rps })
+        let is_finite = [linear_mps, angular_rps].as_flattened().iter().all(|value| value.is_finite());
+        Ok(Self { transform, twist: is_finite.then_some(Twist { linear_mps, angular_rps }) })
     }
 
-    /// Encodes the message, little-endian, with covariances of 0.
+    /// Encodes the message, little-endian, with covariances of 0, and NaN for an unknown twist.
     pub fn to_cdr(&self) -> Vec<u8> {
         let mut writer = Writer::default();
         writer.header(&self.transform.header).text(self.transform.child_frame_id);
         write_pose(&mut writer, &self.transform.parent_from_child).f64s(&[0.0; 36]);
-        writer.f64s(&self.linear_mps).f64s(&self.angular_rps).f64s(&[0.0; 36]);
+        let unknown = Twist { linear_mps: [f64::NAN; 3], angular_rps: [f64::NAN; 3] };
+        let Twist { linear_mps, angular_rps } = self.twist.unwrap_or(unknown);
+        writer.f64s(&linear_mps).f64s(&angular_rps).f64s(&[0.0; 36]);
         writer.finish()
     }
 }
@@ -75,22 +102,47 @@ pub fn pose_stamped(message: &[u8]) -> Result<StampedTransform<'_>, MessageError
     Ok(StampedTransform { header, child_frame_id: "", parent_from_child: pose(&mut reader, "pose")? })
 }
 
-/// Reads a `tf2_msgs/msg/TFMessage`.
+/// Reads a `tf2_msgs/msg/TFMessage`. A wrong stamp, quaternion, number or name costs its transform alone, as in tf2.
 ///
 /// # Errors
-/// As [`Odometry::new`]; [`MessageError::Value`] also if there are more than 4096 transforms.
-pub fn tf_message(message: &[u8]) -> Result<Vec<StampedTransform<'_>>, MessageError> {
+/// [`MessageError`] as of [`Reader`] if the message does not have the bytes of its transforms;
+/// [`MessageError::Value`] if there are more than 4096 of them.
+pub fn tf_message(message: &[u8]) -> Result<TfMessage<'_>, MessageError> {
     let mut reader = Reader::new(message)?;
     let count = reader.count("transforms", TRANSFORM_LENGTH)?;
     if count > TRANSFORMS_MAX {
         return Err(MessageError::value("transforms", count, "up to 4096 transforms"));
     }
-    let transform = |_| {
-        let header = reader.header()?;
+    let mut read = TfMessage::default();
+    for _ in 0..count {
+        // All members are read before any is judged, so that the next transform is found.
+        let stamp_ns = reader.stamp("transforms[].header.stamp");
+        let frame_id = reader.text("transforms[].header.frame_id")?;
         let child_frame_id = reader.text("transforms[].child_frame_id")?;
-        Ok(StampedTransform { header, child_frame_id, parent_from_child: pose(&mut reader, "transforms[].transform")? })
-    };
-    (0..count).map(transform).collect()
+        let numbers = reader.f64s("transforms[].transform")?;
+        let judged = stamp_ns.and_then(|stamp_ns| {
+            if child_frame_id.is_empty() || frame_id.is_empty() || child_frame_id == frame_id {
+                let shown = format!("{frame_id:?} to {child_frame_id:?}");
+                return Err(MessageError::value("transforms[]", shown, "two frames with different names"));
+            }
+            let parent_from_child = isometry(numbers, "transforms[].transform")?;
+            let header = Header { stamp_ns, frame_id };
+            Ok(StampedTransform { header, child_frame_id, parent_from_child })
+        });
+        match judged {
+            Ok(transform) => read.transforms.push(transform),
+            Err(fault) => {
+                let fault = match fault {
+                    MessageError::Value { what, value, allowed } => {
+                        MessageError::value(what, format!("{value} of frame {child_frame_id}"), allowed)
+                    }
+                    other => return Err(other),
+                };
+                read.refused.push(RefusedTransform { child_frame_id, fault });
+            }
+        }
+    }
+    Ok(read)
 }
 
 /// Encodes a `tf2_msgs/msg/TFMessage`, little-endian.
@@ -112,13 +164,19 @@ pub fn pose_array_to_cdr(header: &Header, poses: &[Isometry3<f64>]) -> Vec<u8> {
     writer.finish()
 }
 
-/// Reads a `geometry_msgs/Pose` or `Transform`: position, then quaternion x y z w.
+/// Reads a `geometry_msgs/Pose`.
 fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, MessageError> {
-    let [x, y, z] = finite(reader.f64s(what)?, what)?;
-    let [i, j, k, w] = reader.f64s(what)?;
+    isometry(reader.f64s(what)?, what)
+}
+
+/// The rigid transform of a position and a quaternion x y z w.
+fn isometry([x, y, z, i, j, k, w]: [f64; 7], what: &'static str) -> Result<Isometry3<f64>, MessageError> {
+    if ![x, y, z].iter().all(|value| value.is_finite()) {
+        return Err(MessageError::value(what, format!("{:?}", [x, y, z]), "finite numbers"));
+    }
     let quaternion = Quaternion::new(w, i, j, k);
     // A range contains no NaN.
-    if !(0.999..=1.001).contains(&quaternion.norm()) {
+    if !(0.99..=1.01).contains(&quaternion.norm_squared()) {
         return Err(MessageError::value(what, format!("quaternion {i} {j} {k} {w}"), "a unit quaternion"));
     }
     Ok(Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_quaternion(quaternion)))
@@ -127,11 +185,4 @@ fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, Messa
 pub(crate) fn write_pose<'a>(writer: &'a mut Writer, pose: &Isometry3<f64>) -> &'a mut Writer {
     // nalgebra stores both in the order of the message: x y z, and x y z w.
     writer.f64s(pose.translation.vector.as_slice()).f64s(pose.rotation.coords.as_slice())
-}
-
-fn finite<const N: usize>(values: [f64; N], what: &'static str) -> Result<[f64; N], MessageError> {
-    match values.iter().all(|value| value.is_finite()) {
-        true => Ok(values),
-        false => Err(MessageError::value(what, format!("{values:?}"), "finite numbers")),
-    }
 }

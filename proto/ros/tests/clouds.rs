@@ -35,6 +35,8 @@ fn number(datatype: Datatype, value: f64, big_endian: bool) -> Vec<u8> {
         Datatype::Uint32 => (value as u32).to_le_bytes().to_vec(),
         Datatype::Float32 => (value as f32).to_le_bytes().to_vec(),
         Datatype::Float64 => value.to_le_bytes().to_vec(),
+        Datatype::Int64 => (value as i64).to_le_bytes().to_vec(),
+        Datatype::Uint64 => (value as u64).to_le_bytes().to_vec(),
     };
     if big_endian {
         bytes.reverse();

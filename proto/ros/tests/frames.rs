@@ -31,7 +31,7 @@ fn a_frame_is_found_up_and_down_its_tree_only() {
     assert_eq!(at("base_link", "left"), None);
     assert_eq!(at("base_link", "absent"), None);
     assert_eq!([frames.steps_up("top", "map"), frames.steps_up("left", "map")], [Some(3), None]);
-    assert!(frames.contains("rig") && !frames.contains("absent"));
+    assert!(frames.names().contains("rig") && !frames.names().contains("absent"));
 }
 
 #[test]

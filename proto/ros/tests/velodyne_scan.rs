@@ -28,7 +28,7 @@ fn packets_decode_to_themselves() {
         let sent: Vec<_> = (0..3).map(|i| (100 + i, 7 * i as u32, vec![i as u8; 1206])).collect();
         let bytes = message(frame_id, &sent);
         let scan = VelodyneScan::new(&bytes).unwrap();
-        assert_eq!((scan.header.stamp_ns, scan.header.frame_id, scan.count), (12_000_000_034, frame_id, 3));
+        assert_eq!((scan.frame_id, scan.count), (frame_id, 3));
         let read: Vec<_> = scan.packets().map(Result::unwrap).collect();
         for ((stamp_ns, data), (seconds, nanoseconds, expected)) in read.iter().zip(&sent) {
             assert_eq!(*stamp_ns, i64::from(*seconds) * 1_000_000_000 + i64::from(*nanoseconds));

@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::io::BufReader;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, UNIX_EPOCH};
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -22,6 +23,7 @@ use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, printable};
 use clearway_daemon::base::file_advice::open_to_read;
 use clearway_daemon::ingest::files::{Kind, kind};
+use clearway_journal::channel::Channel;
 use clearway_journal::encode::event_from_bytes;
 use clearway_journal::mcap_reader::{McapReader, Message};
 
@@ -45,12 +47,13 @@ pub struct InfoArguments {
 pub fn run(options: &InfoArguments) -> Result<Exit> {
     let file = &options.file;
     files::open(file)?;
-    let document = match kind(file)? {
+    let mut document = match kind(file)? {
         // Its errors name the file.
         Kind::Mcap => recording(file)?,
         Kind::Scan => scan_file(file).with_context(|| file.display().to_string())?,
         Kind::Capture => capture(file).with_context(|| file.display().to_string())?,
     };
+    document["size_bytes"] = std::fs::metadata(file)?.len().into();
     if options.json {
         print_line(&serde_json::to_string_pretty(&document)?)?;
     } else {
@@ -106,12 +109,14 @@ fn recording(file: &Path) -> Result<Value> {
     let mut grids: BTreeMap<String, Value> = BTreeMap::new();
     // By topic: the number of messages that cannot be decoded, and the fault of the first.
     let mut unreadable: BTreeMap<String, (u64, String)> = BTreeMap::new();
-    let mut span: Option<(u64, u64)> = None;
+    let mut span = Span::default();
+    let mut spans: BTreeMap<String, Span> = BTreeMap::new();
     for message in recording.by_ref() {
         let message = message?;
         *messages.entry(message.channel.topic.clone()).or_default() += 1;
-        let at = message.log_ns;
-        span = Some(span.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
+        let at = i64::try_from(message.log_ns).unwrap_or(i64::MAX);
+        span.extend(at);
+        spans.entry(message.channel.topic.clone()).or_default().extend(at);
         let mut add_unreadable = |message: &Message, reason: &dyn Display| {
             let of_topic = unreadable.entry(message.channel.topic.clone());
             of_topic.or_insert_with(|| (0, reason.to_string())).0 += 1;
@@ -139,6 +144,15 @@ fn recording(file: &Path) -> Result<Value> {
         vehicles.entry(vehicle).or_default().insert(layer, count);
     }
     let header = recording.header();
+    let topic = |(channel, count): (&Channel, u64)| {
+        let span = spans.get(&channel.topic).copied().unwrap_or_default();
+        let rate_hz = span.seconds().filter(|seconds| *seconds > 0.0).map(|seconds| (count - 1) as f64 / seconds);
+        let described = json!({
+            "type": channel.schema, "encoding": channel.encoding, "messages": count, "rate_hz": rate_hz.map(rounded),
+        });
+        (channel.topic.clone(), described)
+    };
+    let topics: Map<String, Value> = recording.channels().into_iter().map(topic).collect();
     let undecoded = unreadable.iter().map(|(topic, (count, first))| {
         format!("{} of {topic} cannot be decoded, the first: {first}", counted(*count, "message"))
     });
@@ -151,7 +165,10 @@ fn recording(file: &Path) -> Result<Value> {
         "state": if faults.is_empty() { "complete".to_owned() } else { faults.join("; ") },
         "damage": damage,
         "repaired": recording.repaired(),
-        "duration_s": span.map(|(first, last)| rounded((last - first) as f64 * 1e-9)),
+        "begins": span.begins(),
+        "ends": span.ends(),
+        "duration_s": span.seconds().map(rounded),
+        "topics": topics,
         "run": header.metadata,
         "maps": vehicles,
         "layers": grids,
@@ -161,6 +178,34 @@ fn recording(file: &Path) -> Result<Value> {
         "calibrations": header.calibrations.keys().collect::<Vec<_>>(),
         "config": header.config,
     }))
+}
+
+/// The first and the last time of what a file holds, ns since the Unix epoch.
+#[derive(Clone, Copy, Default)]
+struct Span(Option<(i64, i64)>);
+
+impl Span {
+    fn extend(&mut self, at: i64) {
+        self.0 = Some(self.0.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
+    }
+
+    fn seconds(self) -> Option<f64> {
+        self.0.map(|(first, last)| last.saturating_sub(first) as f64 * 1e-9)
+    }
+
+    fn begins(self) -> Option<String> {
+        self.0.map(|(first, _)| date(first))
+    }
+
+    fn ends(self) -> Option<String> {
+        self.0.map(|(_, last)| date(last))
+    }
+}
+
+/// A time as date and time in UTC.
+fn date(ns: i64) -> String {
+    let since = Duration::from_nanos(u64::try_from(ns).unwrap_or(0));
+    humantime::format_rfc3339_millis(UNIX_EPOCH + since).to_string()
 }
 
 /// The shape, classes and channels of a recorded layer.
@@ -185,7 +230,7 @@ fn capture(file: &Path) -> Result<Value> {
     let mut sources: BTreeMap<SocketAddr, CaptureSender> = BTreeMap::new();
     let (mut packets, mut telemetry, mut other) = (0_u64, 0_u64, 0_u64);
     let mut ports: BTreeMap<String, u64> = BTreeMap::new();
-    let mut span: Option<(i64, i64)> = None;
+    let mut span = Span::default();
     let mut cut = None;
     for datagram in capture.by_ref() {
         let datagram = match datagram {
@@ -196,15 +241,26 @@ fn capture(file: &Path) -> Result<Value> {
             }
         };
         let at = datagram.stamp_ns;
-        span = Some(span.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
+        span.extend(at);
         *ports.entry(datagram.destination_port.to_string()).or_default() += 1;
         match datagram.payload.len() {
             PACKET_LENGTH => packets += 1,
             TELEMETRY_LENGTH => telemetry += 1,
             _ => other += 1,
         }
-        // A sensor sends data and telemetry from two ports.
-        let sender = SocketAddr::new(datagram.source.ip(), 0);
+        // Sensors with the factory address differ by the port that they send to; telemetry has a port of its own.
+        let ip = datagram.source.ip();
+        let (unknown, of_data) = (SocketAddr::new(ip, 0), SocketAddr::new(ip, datagram.destination_port));
+        let sender = match datagram.payload.len() {
+            TELEMETRY_LENGTH => sources.keys().find(|known| known.ip() == ip).copied().unwrap_or(unknown),
+            _ => of_data,
+        };
+        // Telemetry came first.
+        if sender == of_data
+            && let Some(telemetry) = sources.remove(&unknown)
+        {
+            sources.insert(of_data, telemetry);
+        }
         let source = sources.entry(sender).or_insert_with(|| CaptureSender {
             sensor: Sensor::new(SensorConfig::default()),
             refused: BTreeMap::new(),
@@ -213,11 +269,13 @@ fn capture(file: &Path) -> Result<Value> {
             *source.refused.entry(refusal.reason()).or_default() += 1;
         }
     }
+    let addresses: Vec<IpAddr> = sources.keys().map(SocketAddr::ip).collect();
     let sensors: BTreeMap<_, _> = sources
         .into_iter()
         .map(|(sender, mut source)| {
             source.sensor.finish();
-            (sender.ip().to_string(), sensor(&source))
+            let is_alone = addresses.iter().filter(|address| **address == sender.ip()).count() == 1;
+            (if is_alone { sender.ip().to_string() } else { sender.to_string() }, sensor(&source))
         })
         .collect();
     let skipped = capture.skipped();
@@ -225,11 +283,13 @@ fn capture(file: &Path) -> Result<Value> {
         "kind": "capture",
         "complete": cut.is_none(),
         "state": cut.clone().unwrap_or_else(|| "complete".into()),
-        "duration_s": span.map(|(first, last)| rounded((last - first) as f64 * 1e-9)),
+        "begins": span.begins(),
+        "ends": span.ends(),
+        "duration_s": span.seconds().map(rounded),
         "packets": packets,
         "telemetry": telemetry,
         "other_datagrams": other,
-        "passed_over": {"not_udp": skipped.not_udp, "fragmented": skipped.fragmented, "unreadable": skipped.unreadable},
+        "passed_over": {"not_udp": skipped.not_udp, "fragmented": skipped.fragmented, "unreadable": skipped.unreadable, "link_type": skipped.link_type},
         "ports": ports,
         "sensors": sensors,
     }))

@@ -190,8 +190,7 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     } else {
         print(&summary.to_text())?
     };
-    let is_expected = serve || summary.received() == 0 || summary.is_all_refused();
-    let has_no_map = summary.reached_end && summary.maps() == 0 && is_expected;
+    let has_no_map = summary.reached_end && summary.maps() == 0;
     if has_no_map {
         eprintln!("clearway: the {} made no map: {}", summary.what, why_no_map(&summary.mount, &summary.snapshot));
     }

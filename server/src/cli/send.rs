@@ -92,21 +92,22 @@ pub fn run(arguments: SendArguments) -> Result<Exit> {
 }
 
 fn document(summary: &SendSummary) -> String {
-    let SendSummary { sent, elapsed, skipped, cut, network } = summary;
+    let SendSummary { sent, elapsed, skipped, notes, cut, network } = summary;
     json!({
-        "packets": sent.packets, "telemetry": sent.telemetry, "skipped": skipped, "seconds": elapsed.as_secs_f64(),
+        "packets": sent.packets, "telemetry": sent.telemetry, "skipped": skipped, "notes": notes, "seconds": elapsed.as_secs_f64(),
         "cut": cut, "network": network.as_ref().map(network::document),
     })
     .to_string()
 }
 
 fn text(summary: &SendSummary, options: &SendOptions) -> String {
-    let SendSummary { sent, elapsed, skipped, cut, network } = summary;
+    let SendSummary { sent, elapsed, skipped, notes, cut, network } = summary;
     let (packets, telemetry) = (counted(sent.packets, "data packet"), counted(sent.telemetry, "telemetry datagram"));
     let (to, telemetry_to, seconds) = (options.to, options.telemetry_to, elapsed.as_secs_f64());
     let mut lines = vec![format!("sent {packets} to {to} and {telemetry} to {telemetry_to} in {seconds:.1} s")];
     lines.extend(network.as_ref().map(network::line));
     lines.extend(skipped.iter().map(|(reason, count)| format!("skipped {count}: {reason}")));
+    lines.extend(notes.iter().cloned());
     lines.extend(cut.as_ref().map(|cut| format!("the capture is not whole: {cut}")));
     lines.join("\n")
 }

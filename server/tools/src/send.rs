@@ -13,6 +13,7 @@ use clearway_daemon::base::files;
 use clearway_daemon::ingest::files::{Kind as FileKind, kind};
 use clearway_journal::mcap_reader::McapReader;
 use clearway_lidar::capture::Capture;
+use clearway_lidar::capture_sensor::CaptureSensor;
 use clearway_lidar::packet::PACKET_LENGTH;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_ros::velodyne_scan::VelodyneScan;
@@ -51,6 +52,8 @@ pub struct SendSummary {
     pub elapsed: Duration,
     /// Number of datagrams and messages that were not sent, by reason.
     pub skipped: BTreeMap<String, u64>,
+    /// What else of the capture was ignored, for people: other sensors, other packets.
+    pub notes: Vec<String>,
     /// Why the file is not whole; `None` if it is.
     pub cut: Option<String>,
     /// What the bad network did; `None` of a good one.
@@ -79,10 +82,11 @@ pub fn send(options: &SendOptions, progress: impl FnMut(u64)) -> Result<SendSumm
         return Err(error);
     }
     if sent.packets + sent.telemetry == 0 {
-        bail!("{} has no Velodyne datagram", options.file.display());
+        let notes: String = datagrams.notes.iter().map(|note| format!("; {note}")).collect();
+        bail!("{} has no Velodyne datagram{notes}", options.file.display());
     }
     let network = network.map(|network| network.counts());
-    Ok(SendSummary { sent, elapsed, skipped: datagrams.skipped, cut: datagrams.cut, network })
+    Ok(SendSummary { sent, elapsed, skipped: datagrams.skipped, notes: datagrams.notes, cut: datagrams.cut, network })
 }
 
 /// The datagrams of a file, with gaps of at most [`GAP_NS_MAX`]. They end at the first error.
@@ -92,6 +96,8 @@ struct RecordedDatagrams<P> {
     /// Datagrams that are read and not returned yet.
     read: VecDeque<Datagram>,
     skipped: BTreeMap<String, u64>,
+    sensor: CaptureSensor,
+    notes: Vec<String>,
     cut: Option<String>,
     error: Option<Error>,
     /// Stamp of the newest datagram as recorded, and the sum of the gaps that were left out, in nanoseconds.
@@ -119,6 +125,8 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
             progress,
             read: VecDeque::new(),
             skipped: BTreeMap::new(),
+            sensor: CaptureSensor::default(),
+            notes: Vec::new(),
             cut: None,
             error: None,
             newest_ns: None,
@@ -132,17 +140,12 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
             DatagramSource::Capture(capture) => {
                 let Some(datagram) = capture.next() else {
                     let skipped = capture.skipped();
-                    for (reason, count) in [
-                        ("not UDP", skipped.not_udp),
-                        ("fragmented", skipped.fragmented),
-                        ("unreadable", skipped.unreadable),
-                    ] {
-                        self.skip(reason, count);
-                    }
+                    self.notes = self.sensor.notes().into_iter().chain(skipped.notes()).collect();
                     return Ok(false);
                 };
                 (self.progress)(capture.offset());
                 match datagram {
+                    Ok(datagram) if !self.sensor.has_sent(&datagram) => {}
                     Ok(datagram) => self.push(datagram.stamp_ns, &datagram.payload),
                     Err(error) => self.cut = Some(error.to_string()),
                 }
@@ -159,9 +162,15 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
                     return Ok(true);
                 }
                 let topic = || message.channel.topic.clone();
-                for packet in VelodyneScan::new(&message.data).with_context(topic)?.packets() {
-                    let (stamp_ns, packet) = packet.with_context(topic)?;
-                    self.push(stamp_ns, packet);
+                let Ok(scan) = VelodyneScan::new(&message.data) else {
+                    self.skip(&format!("a message of {} that is damaged", topic()), 1);
+                    return Ok(true);
+                };
+                for packet in scan.packets() {
+                    match packet {
+                        Ok((stamp_ns, packet)) => self.push(stamp_ns, packet),
+                        Err(fault) => self.skip(&format!("packet of {}: {fault}", topic()), 1),
+                    }
                 }
             }
         }

@@ -14,7 +14,7 @@ use clearway_mapping::event::Body;
 use clearway_ros::PointCloud2;
 use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::Field;
-use clearway_ros::pose::{Odometry, StampedTransform, tf_message_to_cdr};
+use clearway_ros::pose::{Odometry, StampedTransform, Twist, tf_message_to_cdr};
 use mcap::records::MessageHeader;
 use nalgebra::{Isometry3, Vector3};
 use zenoh::qos::CongestionControl;
@@ -73,7 +73,8 @@ fn transform<'a>(stamp_ns: i64, parent: &'a str, child: &'a str, [x, y, z]: [f64
 
 fn odometry(stamp_ns: i64) -> Vec<u8> {
     let transform = transform(stamp_ns, "odom", "base_link", [7.0, 1.0, 0.0]);
-    Odometry { transform, linear_mps: [0.5, 0.0, 0.0], angular_rps: [0.0; 3] }.to_cdr()
+    let twist = Some(Twist { linear_mps: [0.5, 0.0, 0.0], angular_rps: [0.0; 3] });
+    Odometry { transform, twist }.to_cdr()
 }
 
 fn bag(file: &Path, messages: &[Message]) {
@@ -141,7 +142,7 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_recorded_and_verified() {
     let notes = summary.notes.join("\n");
     for said in [
         "/velodyne_points is used; tf places its frame velodyne",
-        "/odom is used for poses of base_link",
+        "poses of base_link are read from /odom",
         "/obstacles (sensor_msgs/msg/PointCloud2) is not used",
         "/merged (sensor_msgs/msg/PointCloud2) is not used",
         "/velodyne_points: 1 message refused, the first: data needs",
@@ -245,7 +246,7 @@ async fn replay_reads_the_requested_topics_and_refuses_an_absent_one() {
         |topics: &[&str]| ReplayOptions { topics: topics.iter().map(|&t| t.into()).collect(), ..options(&file) };
     let summary = replayed(with_topics(&["/merged"])).await.unwrap();
     assert!(
-        summary.notes.join("\n").contains("/merged is used; tf does not place its frame base_link 0.1 to 20 m"),
+        summary.notes.join("\n").contains("/merged is used; its frame base_link is the vehicle's"),
         "{:?}",
         summary.notes
     );
@@ -283,7 +284,7 @@ async fn tf_gives_poses_and_speed_without_odometry_in_a_bag_of_two_files() {
     // The first transform has no speed, so it makes no pose.
     assert_eq!((ledger.poses, ledger.poses_refused), (stamps.len() as u64 - 1, 0));
     assert_eq!(summary.snapshot.maps, stamps.len() as u64);
-    assert!(summary.notes.join("\n").contains("tf is used for poses of base_link in map"), "{:?}", summary.notes);
+    assert!(summary.notes.join("\n").contains("poses of base_link are read from tf, in map"), "{:?}", summary.notes);
     for entry in clearway_journal::reader::RecordingReader::open(&record).unwrap() {
         let clearway_journal::reader::RecordedMessage::Event { event, .. } = entry.unwrap() else { continue };
         let Body::EgoPose(pose) = event.body else { continue };

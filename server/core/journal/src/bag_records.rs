@@ -1,12 +1,14 @@
 //! A ROS 2 bag in sqlite (`.db3`) -> the records that an MCAP file of the same messages would have, in the order of
-//! their times.
+//! their times. Nothing is written beside the bag: where SQLite would, it reads a copy.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::io::Read;
-use std::path::Path;
+use std::fs::File;
+use std::io::{Error, Read};
+use std::path::{Path, PathBuf};
 
 use mcap::records::{Channel, MessageHeader, Record, SchemaHeader};
 use rusqlite::{Connection, OpenFlags, params};
+use tempfile::TempDir;
 
 use super::chunk::RECORD_BYTES_MAX;
 use super::damage::LostPart;
@@ -20,6 +22,8 @@ const ZSTD: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
 /// A bag while it is read.
 pub(super) struct BagRecords {
     bag: Connection,
+    /// Holds the copy that is read; removed after the connection.
+    _copy: Option<TempDir>,
     waiting: VecDeque<Record<'static>>,
     /// Time and id of the newest message.
     newest: (i64, i64),
@@ -34,8 +38,21 @@ impl BagRecords {
     /// # Errors
     /// If it is not a bag, or its tables cannot be read.
     pub(super) fn open(file: &Path) -> rusqlite::Result<Self> {
+        let copied = |error: Error| {
+            let advice = "the bag has a -wal of a crash, and reading it needs a copy of both files in the folder for \
+                          temporary files (TMPDIR)";
+            let code = rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_CANTOPEN);
+            rusqlite::Error::SqliteFailure(code, Some(format!("{advice}: {error}")))
+        };
+        let (file, copy, is_unchanging) = readable(file).map_err(copied)?;
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-        let bag = Connection::open_with_flags(file, flags)?;
+        let bag = match is_unchanging {
+            true => {
+                let uri = format!("file:{}?immutable=1", percent_encoded(&file));
+                Connection::open_with_flags(uri, flags | OpenFlags::SQLITE_OPEN_URI)?
+            }
+            false => Connection::open_with_flags(&file, flags)?,
+        };
         let mut waiting = VecDeque::new();
         let mut topics = bag.prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")?;
         let mut rows = topics.query([])?;
@@ -50,7 +67,7 @@ impl BagRecords {
         drop(rows);
         drop(topics);
         let newest = (i64::MIN, i64::MIN);
-        Ok(Self { bag, waiting, newest, bytes_read: 0, has_ended: false, lost: Vec::new() })
+        Ok(Self { bag, _copy: copy, waiting, newest, bytes_read: 0, has_ended: false, lost: Vec::new() })
     }
 
     /// Number of bytes of the messages so far.
@@ -111,6 +128,37 @@ impl BagRecords {
         }
         Ok(())
     }
+}
+
+/// The bag to open, the folder of the copy if it is one, and true if no program writes it and SQLite need not look.
+fn readable(file: &Path) -> Result<(PathBuf, Option<TempDir>, bool), Error> {
+    let beside = |ending: &str| {
+        let mut name = file.as_os_str().to_owned();
+        name.push(ending);
+        PathBuf::from(name)
+    };
+    // Bytes 18 and 19 of the head: 2 if the bag is written with a log of its own, -wal, whose index SQLite writes.
+    let mut head = [0; 20];
+    let has_log = File::open(file)?.read_exact(&mut head).is_ok() && head[18..] == [2, 2];
+    let log = beside("-wal");
+    if !has_log || beside("-shm").exists() {
+        return Ok((file.to_owned(), None, false));
+    }
+    if !log.exists() {
+        return Ok((file.to_owned(), None, true));
+    }
+    let folder = tempfile::tempdir()?;
+    let copy = folder.path().join("bag.db3");
+    std::fs::copy(file, &copy)?;
+    std::fs::copy(&log, folder.path().join("bag.db3-wal"))?;
+    Ok((copy, Some(folder), false))
+}
+
+/// A path in a URI.
+fn percent_encoded(path: &Path) -> String {
+    let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/-_.~".contains(&byte);
+    let of_byte = |&byte: &u8| if plain(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") };
+    path.as_os_str().as_encoded_bytes().iter().map(of_byte).collect()
 }
 
 fn decompressed(data: &[u8]) -> rusqlite::Result<Vec<u8>> {

@@ -9,6 +9,8 @@ pub struct Channel {
     pub topic: String,
     /// The name of the schema, such as `clearway.v1.Map`.
     pub schema: String,
+    /// The encoding of the messages, such as `cdr` or `ros1`.
+    pub encoding: String,
     /// The kind of the messages.
     pub content: Content,
 }

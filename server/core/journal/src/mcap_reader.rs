@@ -313,6 +313,14 @@ impl McapReader {
         self.lost_messages().is_some_and(|lost| lost > 0) || self.order.fault(false).is_some()
     }
 
+    /// The channels so far, by topic, each with the number of its messages.
+    pub fn channels(&self) -> Vec<(&Channel, u64)> {
+        let counted = self.channels.iter().map(|(id, channel)| (&**channel, self.counts.messages_of(*id)));
+        let mut channels: Vec<_> = counted.collect();
+        channels.sort_by(|a, b| a.0.topic.cmp(&b.0.topic));
+        channels
+    }
+
     fn topic(&self, id: u16) -> String {
         self.channels.get(&id).map_or_else(|| format!("channel {id}"), |of| of.topic.clone())
     }
@@ -381,7 +389,8 @@ impl McapReader {
             Record::Channel(of) => {
                 let schema = self.schemas.get(&of.schema_id).cloned().unwrap_or_default();
                 let content = Content::of(&of.topic, &schema, &of.message_encoding);
-                self.channels.insert(of.id, Arc::new(Channel { topic: of.topic.clone(), schema, content }));
+                let (topic, encoding) = (of.topic.clone(), of.message_encoding.clone());
+                self.channels.insert(of.id, Arc::new(Channel { topic, schema, encoding, content }));
             }
             Record::Message { header, data } => {
                 let losses = self.loss_count();

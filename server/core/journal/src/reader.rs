@@ -12,7 +12,7 @@ use clearway_proto::v1;
 use clearway_ros::Kind;
 use prost::Message as _;
 
-use super::channel::Content;
+use super::channel::{Channel, Content};
 use super::damage::Damage;
 use super::mcap_reader::{Header, McapReadError, McapReader, McapSource, Message};
 use crate::RecordedMaps;
@@ -173,6 +173,11 @@ impl RecordingReader {
     /// The contents before the first message.
     pub fn header(&self) -> &Header {
         self.reader.header()
+    }
+
+    /// The channels so far, by topic, each with the number of its messages.
+    pub fn channels(&self) -> Vec<(&Channel, u64)> {
+        self.reader.channels()
     }
 
     /// Number of bytes read so far.

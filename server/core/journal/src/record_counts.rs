@@ -57,6 +57,11 @@ impl RecordCounts {
         self.messages.contains_key(&channel_id)
     }
 
+    /// Number of messages of this channel that were read.
+    pub(super) fn messages_of(&self, channel_id: u16) -> u64 {
+        self.messages.get(&channel_id).copied().unwrap_or(0)
+    }
+
     /// True if the recorder has dropped messages.
     pub(super) fn has_dropped(&self) -> bool {
         self.recorder.iter().flat_map(|counts| &counts.topics).any(|topic| topic.dropped > 0)

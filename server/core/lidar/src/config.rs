@@ -16,7 +16,8 @@ pub struct SensorConfig {
     pub calibration: Option<Calibration>,
     /// Encoder angle at which revolutions are cut, in degrees.
     pub cut_azimuth_deg: f32,
-    /// Greatest age of GPS time at its arrival, in ns; older GPS time is ignored ([`crate::clock`]).
+    /// Greatest age of GPS time at its arrival, in ns; older GPS time is ignored, and GPS time that is as far ahead of
+    /// its arrival, less six hours ([`crate::clock`]).
     pub gps_late_ns_max: i64,
     /// Greatest time, in ns, by which stamps may be ahead of the clock that they follow; if they are ahead by more,
     /// they go back and a new epoch begins. 0: stamps never go back ([`crate::clock`]).

@@ -32,7 +32,7 @@ mod time;
 
 pub use calibration::{Calibration, CalibrationError, LaserCalibration};
 pub use config::SensorConfig;
-pub use datagram::{DatagramError, capture, nmea, packet, telemetry};
+pub use datagram::{DatagramError, capture, capture_sensor, nmea, packet, telemetry};
 pub use model::{Model, ModelSpec, ReturnMode};
 pub use revolution::{Blocked, BlockedSector, Echo, Firing, Partial, Point, Revolution};
 pub use sensor::Sensor;

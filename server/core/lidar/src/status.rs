@@ -53,8 +53,33 @@ pub struct SensorStatus {
     pub clock_offset_ms: i64,
     /// Number of the epoch of the newest revolution ([`crate::Revolution::epoch`]).
     pub epoch: u32,
+    /// True if the device time of the packets stands still: the stamps follow the arrival of the packets.
+    pub device_time_stands: bool,
+    /// Time by which GPS time is ahead of its arrival, in ns, if it is not used because it is too far away.
+    pub gps_ahead_ns: Option<i64>,
     /// State of the pulse per second in the newest telemetry.
     pub pps: Option<Pps>,
     /// GPRMC of the newest telemetry.
     pub gprmc: Option<Gprmc>,
+}
+
+/// Rate above which no sensor of the family turns, in revolutions per minute: the fastest turn at 1,200.
+const RPM_MAX: f32 = 1500.0;
+
+impl SensorStatus {
+    /// What is remarkable about the values that the sensor sends, for people: one line each.
+    pub fn remarks(&self) -> Vec<String> {
+        let still = self
+            .device_time_stands
+            .then(|| "its device time stands still, so its stamps follow the arrival of its packets".to_owned());
+        let fast = self.rpm.filter(|rpm| *rpm > RPM_MAX && !self.device_time_stands).map(|rpm| {
+            format!("it turns at {rpm:.0} rpm, faster than any model: packets of two sensors arrive as one stream")
+        });
+        let gps = self.gps_ahead_ns.map(|ahead_ns| {
+            let (hours, way) =
+                (ahead_ns.unsigned_abs() as f64 / 3.6e12, if ahead_ns > 0 { "ahead of" } else { "behind" });
+            format!("GPS time is {hours:.1} h {way} its arrival and not used: see `gps_late_days_max`")
+        });
+        [still, fast, gps].into_iter().flatten().collect()
+    }
 }

@@ -120,7 +120,7 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
             nalgebra::vector![0.0, 0.0, 0.3 * seconds],
         );
         let stamp_ns = revolution.end_ns + i64::from(step - 15) * 10_000_000;
-        motion.push_pose(&EgoPose { stamp_ns, map_from_ego, speed_mps: 15.0 });
+        motion.push_pose(&EgoPose { stamp_ns, map_from_ego, speed_mps: 15.0 }, 0);
     }
     let (mut sweep, mut moved) = (Sweep::default(), EgoTrajectory::default());
     let slots = revolution.echoes[0].range_m.len();

@@ -85,13 +85,13 @@ impl Inputs {
             Body::Datagram(payload) => self.apply_datagram(event.source, payload, now)?,
             Body::Scan(scan) => {
                 let (sensor, newest) = sensor_mut(&mut self.sensors, &mut self.scans, event.source)?;
-                let removed = sensor.apply_scan(scan, newest, &self.motion, now, self.deadline_ns)?;
+                let removed = sensor.apply_scan(scan, newest, &mut self.motion, now, self.deadline_ns)?;
                 Outcome { completed_scan: Some(removed), packets_unfit: 0 }
             }
             Body::End | Body::Withdrawn => {
                 self.check_may_end(event)?;
                 let (sensor, newest) = sensor_mut(&mut self.sensors, &mut self.scans, event.source)?;
-                let completed_scan = sensor.finish(newest, &self.motion, now);
+                let completed_scan = sensor.finish(newest, &mut self.motion, now);
                 Outcome { completed_scan, packets_unfit: sensor.drain_unfit() }
             }
             Body::EgoPose(pose) => self.apply_ego_pose(pose, now).map(|()| Outcome::default())?,
@@ -173,7 +173,7 @@ impl Inputs {
 
     fn apply_datagram(&mut self, source: u16, payload: &[u8], now: EventTime) -> Result<Outcome, EventError> {
         let (sensor, newest) = sensor_mut(&mut self.sensors, &mut self.scans, source)?;
-        let completed_scan = sensor.apply_datagram(payload, newest, &self.motion, now)?;
+        let completed_scan = sensor.apply_datagram(payload, newest, &mut self.motion, now)?;
         if payload.len() == TELEMETRY_LENGTH {
             sensor.apply_speed(&mut self.motion);
         }
@@ -189,10 +189,13 @@ impl Inputs {
         let is_silent = self.pose_event_ns.is_some_and(|ns| now.event_ns.saturating_sub(ns) > self.deadline_ns);
         if is_silent && newest_ns.is_some_and(|newest_ns| pose.stamp_ns <= newest_ns) {
             self.motion.forget_poses();
-        } else {
-            check_newer(pose.stamp_ns, newest_ns)?;
+        } else if let Err(refusal) = check_newer(pose.stamp_ns, newest_ns) {
+            if newest_ns.is_some_and(|newest_ns| pose.stamp_ns < newest_ns) {
+                self.motion.note_refused_pose(pose.stamp_ns, now.event_ns);
+            }
+            return Err(refusal);
         }
-        self.motion.push_pose(pose);
+        self.motion.push_pose(pose, now.event_ns);
         self.pose_event_ns = Some(now.event_ns);
         Ok(())
     }

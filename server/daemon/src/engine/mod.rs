@@ -239,6 +239,7 @@ impl Engine {
             stages: StageTimes { receive, map, encode, total },
             validity: Duration::from_millis(self.valid_ms.into()),
             speed_m_s,
+            has_pose: self.pipeline.newest_map().is_some_and(|map| map.map_from_ego.is_some()),
             is_shifted,
         });
         self.newest.send_replace(Some(encoded.clone()));

@@ -22,7 +22,7 @@ pub struct DropCounters {
     pub(super) unreported: Mutex<Unreported>,
     /// The newest last.
     unknown_senders: Mutex<VecDeque<UnknownSender>>,
-    /// Refused messages by reason; the ledger counts all of them as `observation`.
+    /// Refused messages by reason; the ledger counts all of them as `observation`, and no part of a message.
     refused_messages: Mutex<BTreeMap<&'static str, u64>>,
     /// Who sends the data of each sensor.
     pub senders: SensorSenders,
@@ -69,6 +69,12 @@ impl DropCounters {
     pub(crate) fn record_refused_messages(&self, source: u16, reason: &'static str, count: u64) {
         self.record(source, Cause::Observation, count);
         *locked(&self.refused_messages).entry(reason).or_default() += count;
+    }
+
+    /// Counts `count` parts of messages (points, fields, transforms, packets) that were refused while the rest of their
+    /// messages is used.
+    pub(crate) fn record_refused_parts(&self, count: u64) {
+        *locked(&self.refused_messages).entry("ros_part").or_default() += count;
     }
 
     /// Remembers the sender of a datagram that arrived at `newest_ns`.

@@ -9,7 +9,8 @@ use super::error::ReplayError;
 use super::summary::Mount;
 use crate::ingest::files::FilesError;
 use crate::ingest::files::mcap::{McapError, McapOptions};
-use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
+use crate::ingest::ros::available::AvailableTopics;
+use crate::ingest::ros::choice::{SensorTopic, TopicChoice};
 
 /// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
 /// roof of a car.
@@ -18,7 +19,7 @@ const MOUNT_HEIGHT_M: f64 = 2.0;
 /// The topics of a ROS bag to read.
 pub(super) fn choice(bag: &Path, wanted: &McapOptions) -> Result<TopicChoice, ReplayError> {
     let offered = AvailableTopics::from_file(bag).map_err(McapError::from).map_err(FilesError::from)?;
-    let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
+    let choice = offered.choose(&wanted.topics, wanted.sensors_max).map_err(McapError::from);
     Ok(choice.map_err(FilesError::from)?)
 }
 

@@ -24,6 +24,7 @@ use crate::config::{Calibrations, Config, Origin, Recorder};
 use crate::ingest::files::ground_revolutions::{GroundRevolutions, points_of};
 use crate::ingest::files::mcap::McapOptions;
 use crate::ingest::files::{Kind, Readings};
+use crate::ingest::ros::choice::SensorTopic;
 use crate::ingest::ros::decoder::PoseSource;
 use crate::player::faults::Faults;
 use crate::player::timeline::{Timeline, Track};
@@ -215,6 +216,12 @@ impl KnownVehicle {
             return Ok(None);
         }
         (wanted.sensors_max, self.tables) = (choice.sensors.len(), vec![vec![None; choice.sensors.len()]]);
+        if let Some(SensorTopic { frame_id, refused_mount: Some(fault), .. }) =
+            choice.sensors.first().filter(|_| !is_given)
+        {
+            self.config.vehicles[0].maps = MapsConfig::none();
+            return Ok(Some(Mount::Refused { frame_id: frame_id.clone(), fault: fault.clone() }));
+        }
         let (sensors, mounts) = sensors_of(&choice);
         sensors.iter().zip(&mounts).for_each(|(sensor, mount)| self.remark(&sensor.name, mount.as_ref()));
         self.config.vehicles[0].sensors = sensors;

@@ -25,6 +25,13 @@ pub enum Mount {
     },
     /// An estimate from the ground in the first revolutions.
     Estimated(MountEstimate),
+    /// Nowhere: the transform that states them was refused, so no map was made.
+    Refused {
+        /// Name of the sensor's frame.
+        frame_id: String,
+        /// Why the transform was refused.
+        fault: String,
+    },
     /// Nowhere: no ground was found to estimate them from, so no map was made.
     Unknown(MountError),
     /// Nowhere: the files hold no revolution, so none are needed.
@@ -63,7 +70,13 @@ pub fn why_no_map(mount: &Mount, snapshot: &Snapshot) -> String {
     if let Mount::Unknown(why) = mount {
         return format!("the mount of the sensor is not known: {why}");
     }
+    if let Mount::Refused { frame_id, fault } = mount {
+        return format!("the transform that places {frame_id} was refused: {fault}");
+    }
     let ledger = &snapshot.ledger;
+    if ledger.received == 0 {
+        return "the files hold no packet, scan or message that is read".to_owned();
+    }
     let refused = ledger.refused.iter().map(|(reason, n)| match snapshot.refusals.get(reason) {
         Some(first) => format!("{n} for {reason}: {first}"),
         None => format!("{n} for {reason}"),
@@ -141,16 +154,11 @@ impl ReplaySummary {
                 known
             }
             Mount::Unknown(why) => json!({ "source": "unknown", "reason": why.to_string() }),
+            Mount::Refused { frame_id, fault } => {
+                json!({ "source": "refused", "frame_id": frame_id, "reason": fault })
+            }
             Mount::Unneeded => json!({ "source": "none" }),
         }
-    }
-
-    /// True if something was received, and all of it but telemetry was refused.
-    pub fn is_all_refused(&self) -> bool {
-        let others = self.others.iter().map(|(_, snapshot)| snapshot);
-        let mut ledgers = std::iter::once(&self.snapshot).chain(others).map(|snapshot| &snapshot.ledger);
-        self.received() > 0
-            && ledgers.all(|ledger| ledger.received == ledger.telemetry + ledger.refused.values().sum::<u64>())
     }
 
     /// The summary as a few lines of text.
@@ -200,13 +208,18 @@ fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
         if several && sensor.is_reference {
             lines.push("  reference sensor: its scans make the maps".to_owned());
         }
+        lines.extend(sensor.status.remarks().iter().map(|remark| format!("  {remark}")));
         if let Some((source, advice)) = sensor.elevations.and_then(|of| Some((of.as_str(), of.advice()?))) {
             lines.push(format!("  elevations {source}: {advice}"));
         }
     }
     let share =
         snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
-    lines.push(format!("{}{share}", counted(snapshot.maps, "map")));
+    let posed = match (snapshot.maps_with_pose, snapshot.maps) {
+        (_, 0) => String::new(),
+        (with_pose, maps) => format!(", {with_pose} of {maps} with a pose"),
+    };
+    lines.push(format!("{}{posed}{share}", counted(snapshot.maps, "map")));
     if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
         lines.push(format!("time to make a map: median {p50:.2} ms, 99th percentile {p99:.2} ms"));
     }
@@ -222,6 +235,7 @@ fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
             "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
             "revolutions": sensor.status.revolutions,
             "elevations": sensor.elevations.map(ElevationSource::as_str),
+            "remarks": sensor.status.remarks(),
         })
     });
     let document = json!({
@@ -231,6 +245,7 @@ fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
         "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
         "revolutions": snapshot.revolutions(),
         "maps": snapshot.maps,
+        "maps_with_pose": snapshot.maps_with_pose,
         "sensors": sensors.collect::<Vec<_>>(),
         "reference_sensor": snapshot.reference_sensor(),
         "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
@@ -259,6 +274,10 @@ pub fn describe(mount: &Mount) -> Option<String> {
         Mount::Tf { ego_frame, frame_id } => Some(format!(
             "from tf, from {frame_id} to {ego_frame}; this assumes that the origin of {ego_frame} is on the ground; \
              if it is not, give --extrinsics"
+        )),
+        Mount::Refused { frame_id, fault } => Some(format!(
+            "unknown, so no map is made: the files state how {frame_id} is mounted, but the transform was refused: \
+             {fault}; give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees)"
         )),
         Mount::Unknown(why) => Some(format!(
             "unknown, so no map is made: the files do not contain how the sensor is mounted, and it cannot be \

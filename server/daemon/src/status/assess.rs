@@ -175,13 +175,18 @@ fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing,
         silent,
         is_refused: since(seen.received_at).is_some_and(|age| age <= SILENT_AFTER)
             && silent.is_none_or(|age| age > SILENT_AFTER),
-        left_out: if matches!(left_out, "late" | "ahead" | "silent") { left_out.to_owned() } else { String::new() },
+        left_out: if matches!(left_out, "late" | "ahead" | "empty" | "silent") {
+            left_out.to_owned()
+        } else {
+            String::new()
+        },
         completeness: state.filter(|_| left_out != "silent").map(|state| state.completeness),
         packets: whole.and_then(|state| Some([state.packets, packets_of_model(&sensor.status, state)?])),
         clock: sensor.status.clock.map_or("", |clock| clock.as_str()).to_owned(),
         clock_offset_ms: sensor.status.clock_offset_ms,
         senders,
         blocked_deg: sensor.status.blocked.sectors.iter().map(|s| f64::from(s.to_deg) - f64::from(s.from_deg)).sum(),
+        remarks: sensor.status.remarks(),
         mount: sensor
             .mount
             .filter(|mount| mount.contradicts)

@@ -97,7 +97,8 @@ pub struct SensorFacts {
     pub silent: Option<Duration>,
     /// True if packets of it have arrived in the last seconds, but none of them could be read.
     pub is_refused: bool,
-    /// Why its newest scan is not, or not as it should be, in the newest map: "late", "ahead", "silent"; else empty.
+    /// Why its newest scan is not, or not as it should be, in the newest map: "late", "ahead", "empty",
+    /// "silent"; else empty.
     pub left_out: String,
     /// Covered share of its newest revolution.
     pub completeness: Option<f32>,
@@ -111,6 +112,8 @@ pub struct SensorFacts {
     pub senders: Vec<String>,
     /// Width of the sectors that have lost their returns, in degrees.
     pub blocked_deg: f64,
+    /// What is remarkable about the values that it sends.
+    pub remarks: Vec<String>,
     /// Height (m), pitch and roll (degrees) by which the ground contradicts the configured mount, if it does.
     pub mount: Option<[f64; 3]>,
 }
@@ -287,6 +290,7 @@ fn sensor_findings(sensor: &SensorFacts, validity: Duration, add: &mut impl FnMu
     if is_silent {
         return;
     }
+    sensor.remarks.iter().for_each(|remark| add(State::Warn, format!("{name}: {remark}")));
     if !sensor.senders.is_empty() {
         let senders = sensor.senders.join(", ");
         add(State::Warn, format!("several send the data of {name}, each in place of the others': {senders}"));

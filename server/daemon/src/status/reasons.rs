@@ -33,9 +33,9 @@ pub const OBSERVATION_REASONS: [&str; 13] = [
     "packets",
     "points",
     "ros_frame",
-    "ros_frames",
     "ros_kind",
     "ros_message",
+    "ros_part",
     "stamp_ahead",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.

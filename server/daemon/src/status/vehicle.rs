@@ -119,6 +119,8 @@ pub(crate) struct MadeMap<'a> {
     pub validity: Duration,
     /// Speed of the vehicle.
     pub speed_m_s: Option<f64>,
+    /// True if its header has the vehicle's pose.
+    pub has_pose: bool,
     /// True if its stamps were moved to the present.
     pub is_shifted: bool,
 }
@@ -136,6 +138,8 @@ pub struct Snapshot {
     pub observations_refused: BTreeMap<&'static str, u64>,
     /// Number of maps made.
     pub maps: u64,
+    /// Number of them that have the vehicle's pose.
+    pub maps_with_pose: u64,
     /// End of the newest map's capture, in ns since the Unix epoch; 0 before the first map.
     pub newest_capture_end_ns: i64,
     /// Drivable share of the newest map, while a reader subscribes to that layer.
@@ -346,12 +350,14 @@ impl VehicleStatus {
 
     /// Records a new map and the time it took.
     pub(crate) fn mapped(&self, made: MadeMap<'_>) {
-        let MadeMap { encoded: map, states, stages, validity, speed_m_s, is_shifted } = made;
+        let MadeMap { encoded: map, states, stages, validity, speed_m_s, has_pose, is_shifted } = made;
         self.traces.published(map, stages);
         let mut state = locked(&self.changing);
         state.states = states;
         // A jump of a replay sets the number back.
         state.counts.maps = map.sequence + 1;
+        let with_pose = state.counts.maps_with_pose + u64::from(has_pose);
+        state.counts.maps_with_pose = with_pose.min(state.counts.maps);
         state.counts.newest_capture_end_ns = map.capture_end_ns;
         state.counts.drivable_share = map.drivable_share;
         let at = self.started.elapsed();

@@ -1,13 +1,15 @@
 //! Files, by the endings of their names -> observations and the stamps at which they are sent.
 
 use std::io::BufReader;
+use std::iter::Peekable;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use clearway_client::observation::{RoadFrame, RoadPurpose};
 use clearway_client::{Observation, now_ns};
-use clearway_lidar::capture::{Capture, CaptureError};
+use clearway_lidar::capture::{Capture, CaptureError, Datagram};
+use clearway_lidar::capture_sensor::CaptureSensor;
 use clearway_mapping::event::{Road, RoadPurpose as Purpose};
 use clearway_mapping::road::rddf::Rddf;
 use clearway_mapping::road::rndf::Rndf;
@@ -232,29 +234,52 @@ fn read_road(text: &str, ending: &str, options: &FileOptions) -> (Result<Road>, 
 /// Datagrams with their stamps, in nanoseconds since the Unix epoch.
 type StampedPackets = Vec<(i64, Vec<u8>)>;
 
-/// The datagrams of a capture, in groups that make one observation each. A capture that is cut off gives those before
-/// the cut.
-///
-/// # Errors
-/// If the file cannot be read.
-pub fn chunks(file: &Path) -> Result<impl Iterator<Item = Result<StampedPackets, CaptureError>>> {
-    let (opened, _) = files::open(file)?;
-    let capture = Capture::new(BufReader::new(opened)).with_context(|| file.display().to_string())?;
-    let mut datagrams = capture.peekable();
-    Ok(std::iter::from_fn(move || {
+/// The datagrams of one sensor of a capture, in groups that make one observation each: an iterator. A capture that is
+/// cut off gives the groups before the cut.
+pub struct PacketGroups {
+    datagrams: Peekable<Capture<'static>>,
+    sensor: CaptureSensor,
+}
+
+impl PacketGroups {
+    /// Opens a capture.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    pub fn open(file: &Path) -> Result<Self> {
+        let (opened, _) = files::open(file)?;
+        let capture = Capture::new(BufReader::new(opened)).with_context(|| file.display().to_string())?;
+        Ok(Self { datagrams: capture.peekable(), sensor: CaptureSensor::default() })
+    }
+
+    /// The datagrams of other sensors so far, for people.
+    pub fn notes(&self) -> Vec<String> {
+        self.sensor.notes()
+    }
+}
+
+impl Iterator for PacketGroups {
+    type Item = Result<StampedPackets, CaptureError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
         let mut packets = StampedPackets::new();
         while packets.len() < PACKETS {
             let first_ns = packets.first().map(|(stamp_ns, _)| *stamp_ns);
             let near =
                 |stamp_ns: i64| first_ns.is_none_or(|first| (0..=PACKETS_NS).contains(&stamp_ns.saturating_sub(first)));
-            match datagrams.next_if(|next| packets.is_empty() || next.as_ref().is_ok_and(|d| near(d.stamp_ns))) {
-                Some(Ok(datagram)) => packets.push((datagram.stamp_ns, datagram.payload)),
+            let is_next =
+                |next: &Result<Datagram, _>| packets.is_empty() || next.as_ref().is_ok_and(|d| near(d.stamp_ns));
+            match self.datagrams.next_if(is_next) {
+                Some(Ok(datagram)) if self.sensor.has_sent(&datagram) => {
+                    packets.push((datagram.stamp_ns, datagram.payload));
+                }
+                Some(Ok(_)) => {}
                 Some(Err(CaptureError::Truncated { .. })) | None => break,
                 Some(Err(error)) => return Some(Err(error)),
             }
         }
         (!packets.is_empty()).then_some(Ok(packets))
-    }))
+    }
 }
 
 #[cfg(test)]

@@ -14,7 +14,7 @@ use serde_json::json;
 
 use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
-use files::{FileOptions, IngestItem, IngestPlan};
+use files::{FileOptions, IngestItem, IngestPlan, PacketGroups};
 
 mod files;
 
@@ -61,6 +61,7 @@ pub fn run(options: &IngestArguments) -> Result<()> {
 
 async fn ingest(options: &IngestArguments) -> Result<()> {
     let plan = IngestPlan::new(&options.files)?;
+    let mut notes = plan.notes.clone();
     let has_scans = plan.items.iter().any(|(_, item)| matches!(item, IngestItem::Scan(_)));
     if !options.sensor.is_empty() && !has_scans && plan.drives.is_empty() {
         return Err(usage_error("--sensor is for scans and drives, and the files have neither"));
@@ -81,15 +82,17 @@ async fn ingest(options: &IngestArguments) -> Result<()> {
         sender.send(kind, 1, *stamp_ns, observation).await?;
     }
     for file in &plan.drives {
-        for chunk in files::chunks(file)? {
-            let packets = chunk.with_context(|| file.display().to_string())?;
+        let mut groups = PacketGroups::open(file)?;
+        for group in groups.by_ref() {
+            let packets = group.with_context(|| file.display().to_string())?;
             let stamp_ns = packets.last().map_or(0, |(stamp_ns, _)| *stamp_ns);
             let observation = Observation::packets(&options.sensor, &packets);
             sender.send("packets", packets.len() as u64, stamp_ns, observation).await?;
         }
+        notes.extend(groups.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
     }
     sender.refusals.extend(sender.ingester.settled().await?);
-    report(&sender, &plan.notes, options.json)?;
+    report(&sender, &notes, options.json)?;
     match sender.is_all_refused() {
         true => bail!("nothing was accepted"),
         false => Ok(()),

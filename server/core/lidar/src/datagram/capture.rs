@@ -1,6 +1,6 @@
 //! pcap and pcapng captures to UDP payloads.
 //!
-//! In: the bytes of a capture (Ethernet with or without VLAN tags, Linux cooked, raw IP). Out: [`Datagram`]s in file
+//! In: the bytes of a capture (Ethernet with or without VLAN tags, Linux cooked, raw IP, the loopback of BSD and Windows). Out: [`Datagram`]s in file
 //! order. Packets that are not a complete UDP datagram are skipped and counted. A file that ends inside a packet gives
 //! all datagrams before that packet, then an error with the position in the file.
 
@@ -39,8 +39,31 @@ pub struct Skipped {
     pub not_udp: u64,
     /// Fragments of datagrams.
     pub fragmented: u64,
-    /// Packets that were cut off at capture, are damaged, or have an unknown link type.
+    /// Packets that were cut off at capture or are damaged.
     pub unreadable: u64,
+    /// Packets of a link type that is not read.
+    pub link_type: u64,
+    /// The first such link type: its number in the list of tcpdump.org.
+    pub first_link_type: Option<i32>,
+}
+
+impl Skipped {
+    /// A line for each reason, for people.
+    pub fn notes(&self) -> Vec<String> {
+        let link_type = self.first_link_type.map_or(String::new(), |link_type| {
+            format!(
+                "packets of link type {link_type} ignored; Ethernet, Linux cooked, raw IP and loopback are read: \
+                 capture at the interface of the sensor"
+            )
+        });
+        let all = [
+            (self.not_udp, "packets that are not UDP ignored"),
+            (self.fragmented, "pieces of fragmented datagrams ignored"),
+            (self.unreadable, "unreadable packets ignored"),
+            (self.link_type, &link_type),
+        ];
+        all.into_iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!("{n} {what}")).collect()
+    }
 }
 
 /// The reason for which a capture cannot be read, or not to its end.
@@ -286,8 +309,14 @@ impl Interface {
             Linktype::ETHERNET => LaxSlicedPacket::from_ethernet(data).ok(),
             Linktype::LINUX_SLL => cooked(data, 14, 16),
             LINUX_SLL2 => cooked(data, 0, 20),
+            // The family of the address, 4 bytes in the byte order of the host or of the network, then IP.
+            Linktype::NULL | Linktype::LOOP => data.get(4..).and_then(|ip| LaxSlicedPacket::from_ip(ip).ok()),
             Linktype::RAW | Linktype::IPV4 | Linktype::IPV6 | Linktype(12 | 14) => LaxSlicedPacket::from_ip(data).ok(),
-            _ => None,
+            Linktype(other) => {
+                skipped.link_type += 1;
+                skipped.first_link_type.get_or_insert(other);
+                return None;
+            }
         };
         let Some(sliced) = sliced else {
             skipped.unreadable += 1;

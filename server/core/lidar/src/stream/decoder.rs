@@ -29,6 +29,10 @@ use crate::time::clock::DeviceClock;
 /// Ours: the slowest rate of a sensor is 300 rpm.
 const REVOLUTION_NS_MAX: i64 = 1_000_000_000;
 
+/// Number of packets in a row with the same device time and other azimuths after which the device time stands still.
+/// Ours: simulators and replacements leave the bytes 0; no sensor fills so many packets in a microsecond.
+const STILL_PACKETS: u32 = 3;
+
 /// True if the decoder may end a revolution with a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum MayCut {
@@ -61,6 +65,8 @@ pub(crate) struct Decoder {
     step: Option<u32>,
     /// Azimuth at which the packet before began.
     packet_azimuth: Option<u32>,
+    /// Device time of the packet before, in µs, and the number of packets in a row that had it.
+    device_time: (u32, u32),
     rpm_configured: Option<f32>,
     status_bytes: StatusBytes,
     status: SensorStatus,
@@ -96,6 +102,7 @@ impl Decoder {
             complete_firings: None,
             step: None,
             packet_azimuth: None,
+            device_time: (u32::MAX, 0),
             rpm_configured: config.rpm,
             status_bytes: StatusBytes::new(config),
             status: SensorStatus { model: Some(model), calibration: source, ..SensorStatus::default() },
@@ -134,7 +141,12 @@ impl Decoder {
     }
 
     pub fn status(&self) -> SensorStatus {
-        SensorStatus { packets_lost: self.loss.lost(), blocked: self.finished.blocked.clone(), ..self.status.clone() }
+        SensorStatus {
+            packets_lost: self.loss.lost(),
+            blocked: self.finished.blocked.clone(),
+            gps_ahead_ns: self.clock.gps_ahead_ns(),
+            ..self.status.clone()
+        }
     }
 
     /// Decodes a packet into the current revolution, and returns true if that finished a revolution.
@@ -212,10 +224,18 @@ impl Decoder {
     /// The time of a packet's first firing on the clock's timeline, in ns.
     fn stamp_packet(&mut self, packet: &Packet<'_>, azimuth_before: Option<u32>, arrival_ns: i64) -> i64 {
         let span_ns = i64::from(self.spec.packet_period_ns(self.mode));
-        let has_time = self.spec.model != Model::Hdl64eS1;
+        let has_time = self.spec.model != Model::Hdl64eS1 && !self.notes_still_time(packet.device_us());
         let elapsed_ns = if has_time { span_ns } else { span_ns * self.packets_since(azimuth_before, packet) };
         let device_us = has_time.then(|| packet.device_us());
         self.clock.push_packet(device_us, elapsed_ns, arrival_ns, span_ns)
+    }
+
+    /// Notes the device time of a packet, and returns true if it stands still.
+    fn notes_still_time(&mut self, device_us: u32) -> bool {
+        let (before_us, packets) = self.device_time;
+        self.device_time = (device_us, if before_us == device_us { packets.saturating_add(1) } else { 0 });
+        self.status.device_time_stands = self.device_time.1 >= STILL_PACKETS;
+        self.status.device_time_stands
     }
 
     /// Counts from the packet before to this one: the step of a sensor whose packets have a single firing (VLS-128 in

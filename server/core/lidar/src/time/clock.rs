@@ -49,7 +49,9 @@
 //! - A GPRMC counts as valid if the receiver reports a valid fix, the device's minutes and seconds agree with it, and
 //!   it is at most [`crate::SensorConfig::gps_late_ns_max`] older than its arrival. An older one is that of an old
 //!   capture, or of a receiver that has lost count of its weeks; arrival then gives the time, as for the planner. A
-//!   GPRMC later than its arrival is valid: no packet arrives before it is sent, so the host's clock is wrong.
+//!   GPRMC that is later than its arrival by less than that, less six hours, is valid: no packet arrives before it is
+//!   sent, so the host's clock is wrong. A GPRMC that is later by more has a wrong date, unless the host's clock was
+//!   never set: it then shows a time before the first of these sensors.
 //! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays
 //!   in force if GPS or the pulse is lost, over a restart, and if the host disagrees. If it is not within reach, the
 //!   stamps go on by arrival.
@@ -84,6 +86,9 @@ const EARLIEST_NS: i64 = 1_104_537_600 * NS_PER_SECOND;
 /// Default of [`crate::SensorConfig::gps_late_ns_max`], in ns: 24 hours. The clock of a host may be wrong by hours
 /// (time zone, battery) but not by days, while the error of a receiver is 1024 weeks.
 pub const GPS_LATE_NS_MAX: i64 = 24 * NS_PER_HOUR;
+/// Time, in ns, by which the limit of GPS time ahead of arrival is less than the limit behind. Ours: a receiver with the
+/// date of tomorrow is then beyond it, and a host whose time zone is wrong is within it.
+const GPS_AHEAD_LESS_NS: i64 = 6 * NS_PER_HOUR;
 /// Latest arrival, in ns since the Unix epoch: the year 2096. Later arrivals are replaced by it, because stamps near
 /// the end of 64 bits would overflow.
 const ARRIVAL_NS_MAX: i64 = 4_000_000_000 * NS_PER_SECOND;
@@ -172,6 +177,8 @@ pub(crate) struct DeviceClock {
     ahead_ns_max: i64,
     timeline: Timeline,
     gps: Option<Gps>,
+    /// Time by which the newest GPRMC is ahead of its arrival, if it was refused for that.
+    gps_ahead_ns: Option<i64>,
     /// Telemetry from behind a jump that no data packet has shown yet.
     pending: Option<PendingGps>,
     minimum_delay: MinimumDelay,
@@ -214,12 +221,26 @@ impl DeviceClock {
             Pps::Absent => !reports_pps,
             Pps::Attempting | Pps::Error | Pps::Unknown(_) => false,
         };
-        let Some(utc_ns) = device_utc_ns(telemetry, arrival_ns, self.gps_late_ns_max) else {
+        let is_set = arrival_ns >= EARLIEST_NS;
+        let ahead_ns = gps_ahead_ns(telemetry, arrival_ns);
+        self.gps_ahead_ns = ahead_ns.filter(|ahead_ns| !self.is_plausible(*ahead_ns, is_set));
+        let Some(utc_ns) = device_utc_ns(telemetry).filter(|_| self.gps_ahead_ns.is_none()) else {
             self.gps.iter_mut().for_each(|gps| gps.locked = false);
             return;
         };
         self.pending = Some(PendingGps { device_us: telemetry.device_us, utc_ns, locked });
         self.apply_pending();
+    }
+
+    /// Time by which GPS time is ahead of its arrival, in ns, if it is not used for that.
+    pub fn gps_ahead_ns(&self) -> Option<i64> {
+        self.gps_ahead_ns
+    }
+
+    /// True if GPS time may be ahead of its arrival by this time; `is_set`: the host's clock was set.
+    fn is_plausible(&self, ahead_ns: i64, is_set: bool) -> bool {
+        let ahead_ns_max = if is_set { (self.gps_late_ns_max - GPS_AHEAD_LESS_NS).max(0) } else { i64::MAX };
+        (-self.gps_late_ns_max..=ahead_ns_max).contains(&ahead_ns)
     }
 
     /// Applies the pending GPRMC if its device time is on the timeline now.
@@ -357,13 +378,16 @@ impl DeviceClock {
     }
 }
 
-/// UTC at which the device's clock showed the time of the telemetry; `None` if its GPRMC is not valid.
-fn device_utc_ns(telemetry: &Telemetry, arrival_ns: i64, late_ns_max: i64) -> Option<i64> {
+/// Time by which the GPRMC of the telemetry is ahead of its arrival; `None` without a valid one.
+fn gps_ahead_ns(telemetry: &Telemetry, arrival_ns: i64) -> Option<i64> {
     let gprmc = telemetry.gprmc.as_ref().filter(|gprmc| gprmc.valid)?;
     let utc_ns = gprmc.utc_ns.filter(|utc_ns| *utc_ns >= EARLIEST_NS)?;
-    if arrival_ns.saturating_sub(utc_ns) > late_ns_max {
-        return None;
-    }
+    Some(utc_ns.saturating_sub(arrival_ns))
+}
+
+/// UTC at which the device's clock showed the time of the telemetry; `None` if its GPRMC is not valid.
+fn device_utc_ns(telemetry: &Telemetry) -> Option<i64> {
+    let utc_ns = gps_ahead_ns(telemetry, 0)?;
     let age_ns = nearest_hour(i64::from(telemetry.device_us) * 1_000 - utc_ns, 0);
     GPRMC_AGE_NS.contains(&age_ns).then_some(utc_ns + age_ns)
 }

@@ -10,6 +10,7 @@
 //! - A map waits for the scans of other sensors that are due with the same stamp: those whose stamp before, plus the
 //!   time between their last two stamps, is the map's stamp. It waits until they are there, until an event shows that a
 //!   quarter of `deadline_ms` has passed, or until the next scan makes a map. A vehicle with one sensor never waits.
+//! - A scan without points and rays makes no map and is in no map while another sensor is usable.
 //! - If no map was made for `deadline_ms` (for `period_ms` if that is more), the next timely scan of any sensor makes
 //!   one: no silent sensor holds back the maps.
 //! - The rows of radial maps are those of the reference sensor once it has completed a scan, whichever sensor is the
@@ -251,9 +252,11 @@ impl Fusion {
     fn makes_map(&self, source: usize, scans: &[SensorScan], now: EventTime) -> bool {
         let since_ns = now.event_ns.saturating_sub(self.newest.map_or(0, |newest| newest.event_ns));
         let is_overdue = since_ns > self.deadline_ns.max(self.period_ns);
-        let first_usable = self
-            .order(scans.len())
-            .find(|&index| index == source || (self.is_fresh(&scans[index], now) && self.is_timely(index, scans, now)));
+        let is_usable = |&index: &usize| {
+            index == source || (self.is_fresh(&scans[index], now) && self.is_timely(index, scans, now))
+        };
+        let seeing = self.order(scans.len()).find(|index| is_usable(index) && !scans[*index].is_empty());
+        let first_usable = seeing.or_else(|| self.order(scans.len()).find(is_usable));
         self.is_timely(source, scans, now)
             && (is_overdue || first_usable == Some(source))
             && self.is_newer(source, &scans[source], is_overdue)

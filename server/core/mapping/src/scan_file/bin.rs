@@ -13,8 +13,8 @@ use crate::sensor::observation::Scan;
 const COORDINATE_M_MAX: f32 = 1000.0;
 /// Greatest intensity: KITTI states 0 to 1, nuScenes 0 to 255.
 const INTENSITY_MAX: f32 = 255.0;
-/// One point in this many may have impossible values. Ours: some programs write lost returns as NaN, and a file that is
-/// read as the wrong format has such values in a third of its points.
+/// One point in this many may have impossible values, beside the lost returns. Ours: a file that is read as the wrong
+/// format has such values in a third of its points.
 const ODD_PARTS_MAX: usize = 20;
 
 /// Reads a KITTI or nuScenes scan. The content decides which it is; if it fits both, it is KITTI's.
@@ -70,9 +70,15 @@ fn odd_value(point: &[u8]) -> Option<(&'static str, f32)> {
     checks.iter().zip(fields).find(|((_, is_possible), value)| !is_possible(*value)).map(|((name, _), v)| (*name, v))
 }
 
+/// True if all coordinates of a point are NaN: an organised cloud states a lost return so.
+fn is_lost(point: &[u8]) -> bool {
+    (0..3).all(|field| float(point, field).is_nan())
+}
+
 fn check_values<const STRIDE: usize>(bytes: &[u8]) -> Result<(), BinDoubt> {
-    let points = bytes.len() / STRIDE;
-    let mut odd = bytes.chunks_exact(STRIDE).enumerate().filter_map(|(at, point)| Some((at, odd_value(point)?)));
+    let stated = || bytes.chunks_exact(STRIDE).enumerate().filter(|(_, point)| !is_lost(point));
+    let points = stated().count();
+    let mut odd = stated().filter_map(|(at, point)| Some((at, odd_value(point)?)));
     let Some((first, (field, value))) = odd.next() else { return Ok(()) };
     let odd = 1 + odd.count();
     if odd * ODD_PARTS_MAX <= points { Ok(()) } else { Err(BinDoubt::Values { odd, points, first, field, value }) }

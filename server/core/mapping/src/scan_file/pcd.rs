@@ -39,7 +39,9 @@ pub fn read_pcd(bytes: &[u8]) -> Result<Scan, ScanFileError> {
                 let words: Vec<&str> = line.split_whitespace().collect();
                 row(fields, |field| words.get(field.column)?.parse().ok())
             };
-            scan_of(text.lines().take(points).map_while(point), fields)
+            // As in PCL, empty lines are none.
+            let lines = text.lines().filter(|line| !line.trim().is_empty());
+            scan_of(lines.take(points).map_while(point), fields)
         }
         other => return Err(pcd_error("DATA", other, "ascii, binary, binary_compressed")),
     }?;
@@ -65,22 +67,31 @@ fn row(fields: [Option<Field>; 5], value: impl Fn(Field) -> Option<f64>) -> Opti
     Some(row)
 }
 
-/// The scan of these points: x, y, z, intensity and ring.
+/// The scan of these points: x, y, z, intensity and ring. A point with a wrong ring counts as lost: its x is NaN.
+///
+/// # Errors
+/// [`ScanFileError::Pcd`] if more than a tenth of the points have a wrong ring.
 fn scan_of(points: impl Iterator<Item = [f64; 5]>, fields: [Option<Field>; 5]) -> Result<Scan, ScanFileError> {
-    let mut scan = Scan::default();
-    for [x, y, z, intensity, ring] in points {
+    let (mut scan, mut first_wrong, mut wrong) = (Scan::default(), None, 0);
+    for [mut x, y, z, intensity, mut ring] in points {
+        if fields[4].is_some() && (!(0.0..=f64::from(u16::MAX)).contains(&ring) || ring.fract() != 0.0) {
+            (first_wrong, wrong) = (first_wrong.or(Some(ring)), wrong + 1);
+            (x, ring) = (f64::NAN, 0.0);
+        }
         scan.x.push(x as f32);
         scan.y.push(y as f32);
         scan.z.push(z as f32);
         scan.intensity.push(intensity as f32);
         if fields[4].is_some() {
-            if !(0.0..=f64::from(u16::MAX)).contains(&ring) || ring.fract() != 0.0 {
-                return Err(pcd_error("ring", &ring.to_string(), "a whole number of 0 to 65535"));
-            }
             scan.ring.push(ring as u16);
         }
     }
-    Ok(scan)
+    match first_wrong {
+        Some(ring) if 10 * wrong > scan.x.len() => {
+            Err(pcd_error("ring", &ring.to_string(), "a whole number of 0 to 65535"))
+        }
+        _ => Ok(scan),
+    }
 }
 
 /// The type of a field's values.

@@ -44,8 +44,9 @@ pub struct SensorConfig {
     /// and the cells there stay unknown.
     #[serde(default)]
     pub blind_deg: Vec<[f32; 2]>,
-    /// Greatest difference between GPS time and arrival, days. If GPS time is older, the stamps of the sensor follow
-    /// the host's clock: then a capture is played live, or the receiver has miscounted the weeks.
+    /// Greatest difference between GPS time and arrival, days. If GPS time is older, or ahead of arrival by as much less
+    /// six hours, the stamps of the sensor follow the host's clock: then a capture is played live, or the receiver's date
+    /// is wrong.
     #[serde(default = "default_gps_late_days_max")]
     pub gps_late_days_max: f64,
     /// Elevation of each laser, degrees; for a sensor that sends scans. They come before those of the model. Without

@@ -41,6 +41,10 @@ const JUMP_M_MAX: f64 = 0.5;
 /// of 1 rad/s the error within the millisecond of 16 firings is less than a tenth of a millimetre at 100 m.
 pub(crate) const KNOT_FIRINGS: usize = 16;
 
+/// Number of poses in a row that go back which make a step of the stamps. Ours: one pose that was overtaken on its way
+/// makes none.
+const STEP_POSES: u32 = 2;
+
 /// Time for which the motion is extrapolated after the newest pose (and before the oldest), milliseconds. 200 is
 /// ours: two revolutions at 10 Hz.
 pub(super) const EXTRAPOLATION_MS: u32 = 200;
@@ -116,19 +120,49 @@ struct SpeedMeasurement {
     speed_mps: f64,
 }
 
+/// A stamp of the poses' clock, and the event time at which it arrived, ns.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct ClockReading {
+    stamp_ns: i64,
+    event_ns: i64,
+}
+
+impl ClockReading {
+    /// How far another stamp of the same clock is from the stamp that this reading lets expect at its event time, ns.
+    fn distance_ns(&self, stamp_ns: i64, event_ns: i64) -> u64 {
+        let expected_ns = self.stamp_ns.saturating_add(event_ns.saturating_sub(self.event_ns));
+        stamp_ns.abs_diff(expected_ns)
+    }
+}
+
+/// Poses in a row whose stamps are older than the newest pose.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct StepBack {
+    poses: u32,
+    /// The newest of them.
+    at: ClockReading,
+}
+
 /// What is known of one vehicle's motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Motion {
     config: MotionConfig,
     /// In the order of their stamps.
     poses: VecDeque<EgoPose>,
+    /// Event time of the first of them, ns; `None` without poses.
+    began_event_ns: Option<i64>,
+    /// The newest of them.
+    newest_read: Option<ClockReading>,
+    /// The poses since then that were refused because their stamps are older.
+    step_back: Option<StepBack>,
     measured: Option<SpeedMeasurement>,
 }
 
 impl Motion {
     /// A motion without poses and speeds.
     pub fn new(config: &MotionConfig) -> Self {
-        Self { config: config.clone(), poses: VecDeque::with_capacity(POSES_MAX), measured: None }
+        let (config, poses) = (config.clone(), VecDeque::with_capacity(POSES_MAX));
+        Self { config, poses, began_event_ns: None, newest_read: None, step_back: None, measured: None }
     }
 
     /// The newest pose; `None` if there is none.
@@ -139,10 +173,48 @@ impl Motion {
     /// Removes all poses.
     pub fn forget_poses(&mut self) {
         self.poses.clear();
+        (self.began_event_ns, self.newest_read, self.step_back) = (None, None, None);
     }
 
-    /// Adds a pose, which must be newer than those before. The oldest pose is removed if there are too many.
-    pub fn push_pose(&mut self, pose: &EgoPose) {
+    /// Notes that a pose was refused at this event time because its stamp is older than the newest one.
+    pub fn note_refused_pose(&mut self, stamp_ns: i64, event_ns: i64) {
+        let in_a_row = self.step_back.filter(|before| before.at.stamp_ns < stamp_ns).map_or(0, |before| before.poses);
+        self.step_back = Some(StepBack { poses: in_a_row + 1, at: ClockReading { stamp_ns, event_ns } });
+    }
+
+    /// The newest refused pose, if the stamps of the poses have stepped back: several poses in a row are older than the
+    /// newest one and newer than each other. A pose that was overtaken comes alone.
+    fn stepped_back(&self) -> Option<ClockReading> {
+        self.step_back.filter(|step| step.poses >= STEP_POSES).map(|step| step.at)
+    }
+
+    /// Removes the poses if their stamps have stepped back and the scan that was completed at this event time has been
+    /// stamped after the step: its stamp is nearer to the refused poses than to the poses before them.
+    pub fn note_scan(&mut self, stamp_ns: i64, event_ns: i64) {
+        if let (Some(after), Some(before)) = (self.stepped_back(), self.newest_read)
+            && after.distance_ns(stamp_ns, event_ns) < before.distance_ns(stamp_ns, event_ns)
+        {
+            self.forget_poses();
+        }
+    }
+
+    /// Removes the poses if a sensor's stamps have begun an epoch and the poses have not: the first of them is older
+    /// than the sensor's last scan before the epoch, at this event time.
+    pub fn begin_epoch(&mut self, last_scan_event_ns: i64) {
+        if self.began_event_ns.is_some_and(|began_ns| began_ns <= last_scan_event_ns) {
+            self.forget_poses();
+        }
+    }
+
+    /// Adds a pose, which must be newer than those before; they are removed if the stamps have stepped back. The oldest
+    /// pose is removed if there are too many.
+    pub fn push_pose(&mut self, pose: &EgoPose, event_ns: i64) {
+        if self.stepped_back().is_some() {
+            self.forget_poses();
+        }
+        self.step_back = None;
+        self.began_event_ns.get_or_insert(event_ns);
+        self.newest_read = Some(ClockReading { stamp_ns: pose.stamp_ns, event_ns });
         debug_assert!(self.newest_pose().is_none_or(|newest| newest.stamp_ns < pose.stamp_ns), "poses in order");
         if self.poses.len() == POSES_MAX {
             self.poses.pop_front();

@@ -180,7 +180,7 @@ impl SensorPipeline {
         &mut self,
         payload: &[u8],
         scan: &mut SensorScan,
-        motion: &Motion,
+        motion: &mut Motion,
         now: EventTime,
     ) -> Result<Option<RemovedPoints>, EventError> {
         let is_complete = self.decoder.push(payload, now.arrival_ns)?.is_some();
@@ -188,7 +188,7 @@ impl SensorPipeline {
     }
 
     /// Ends the source: writes what is left of its revolution to `scan`, if anything is left.
-    pub fn finish(&mut self, scan: &mut SensorScan, motion: &Motion, now: EventTime) -> Option<RemovedPoints> {
+    pub fn finish(&mut self, scan: &mut SensorScan, motion: &mut Motion, now: EventTime) -> Option<RemovedPoints> {
         self.decoder.finish()?;
         self.apply_revolution(scan, motion, now)
     }
@@ -208,8 +208,17 @@ impl SensorPipeline {
         }
     }
 
-    fn apply_revolution(&mut self, scan: &mut SensorScan, motion: &Motion, now: EventTime) -> Option<RemovedPoints> {
+    fn apply_revolution(
+        &mut self,
+        scan: &mut SensorScan,
+        motion: &mut Motion,
+        now: EventTime,
+    ) -> Option<RemovedPoints> {
         let revolution = self.decoder.newest()?;
+        if scan.completed > 0 && scan.is_revolution && revolution.epoch > scan.state.epoch {
+            motion.begin_epoch(scan.completed_at.event_ns);
+        }
+        motion.note_scan(revolution.end_ns, now.event_ns);
         let (mount, filter) = (&self.mount, self.filter.as_ref());
         motion.follow_revolution(revolution, &mut self.trajectory);
         let sweep = scan.next_sweep();
@@ -242,7 +251,7 @@ impl SensorPipeline {
         &mut self,
         scan: &Scan,
         newest: &mut SensorScan,
-        motion: &Motion,
+        motion: &mut Motion,
         now: EventTime,
         deadline_ns: i64,
     ) -> Result<RemovedPoints, EventError> {
@@ -255,10 +264,13 @@ impl SensorPipeline {
         {
             check_newer(scan.stamp_ns, Some(newest_ns))?;
         }
-        if let Some(epoch) = &mut self.scan_epoch {
-            let goes_back = self.newest_scan.is_some_and(|(newest_ns, _)| scan.stamp_ns < newest_ns);
-            *epoch = epoch.saturating_add(u32::from(goes_back));
+        if let (Some(epoch), Some((newest_ns, accepted_ns))) = (&mut self.scan_epoch, self.newest_scan)
+            && scan.stamp_ns < newest_ns
+        {
+            *epoch = epoch.saturating_add(1);
+            motion.begin_epoch(accepted_ns);
         }
+        motion.note_scan(scan.stamp_ns, now.event_ns);
         self.newest_scan = Some((scan.stamp_ns, now.event_ns));
         self.find_elevations(scan);
         motion.follow_scan(scan, &mut self.trajectory);
@@ -289,6 +301,9 @@ impl SensorPipeline {
 
     /// Finds the elevations behind scan events, unless they are known: from the scan's rings, else from its points.
     fn find_elevations(&mut self, scan: &Scan) {
+        if scan.x.is_empty() {
+            return;
+        }
         let is_tried = self.scans < ESTIMATES_MAX;
         if self.scan_calibration.is_none() {
             let by_rings = rings::measured(scan).map(|found| (found, ElevationSource::Rings));
@@ -373,7 +388,11 @@ fn scan_state(name: &Arc<str>, scan: &Scan, elevations: ElevationSource, returns
         returns,
         // The sender alone can tell which part of its field of view is missing.
         completeness: 1.0,
-        contribution: Contribution::Ok,
+        contribution: if scan.x.is_empty() && scan.no_returns.is_empty() {
+            Contribution::Empty
+        } else {
+            Contribution::Ok
+        },
         clock: "sender",
         clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
         elevations: Some(elevations),

@@ -9,7 +9,7 @@ use nalgebra::Isometry3;
 use crate::event_time::EventTime;
 use crate::sensor::motion::Compensation;
 use crate::sensor::rays::Rays;
-use crate::sensor::state::SensorState;
+use crate::sensor::state::{Contribution, SensorState};
 use crate::sensor::sweep::Sweep;
 
 /// The newest scan of one sensor, made from a revolution of its firings or from a scan event.
@@ -62,6 +62,11 @@ impl SensorScan {
     pub fn next_sweep(&mut self) -> &mut Sweep {
         std::mem::swap(&mut self.sweep, &mut self.spare);
         Arc::make_mut(&mut self.sweep)
+    }
+
+    /// True if the sender has stated a scan without points and rays: it is blind, and shows neither rings nor motion.
+    pub fn is_empty(&self) -> bool {
+        self.completed > 0 && self.state.contribution == Contribution::Empty
     }
 
     /// True if no sensor has this index at present: the one that had it was withdrawn.

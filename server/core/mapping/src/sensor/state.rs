@@ -52,6 +52,8 @@ pub enum Contribution {
     Late,
     /// The scan is not in the map: the sensor's clock is ahead.
     Ahead,
+    /// The scan is not in the map: it has no point and no ray. The sensor sends, and sees nothing.
+    Empty,
     /// The sensor has completed no scan within the deadline.
     #[default]
     Silent,
@@ -65,6 +67,7 @@ impl Contribution {
             Self::Partial => "partial",
             Self::Late => "late",
             Self::Ahead => "ahead",
+            Self::Empty => "empty",
             Self::Silent => "silent",
         }
     }

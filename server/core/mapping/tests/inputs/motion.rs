@@ -37,8 +37,8 @@ fn at(x: f64, y: f64, yaw: f64) -> Isometry3<f64> {
 fn between_poses_translation_is_linear_and_rotation_a_slerp() {
     let mut motion = Motion::new(&MotionConfig::default());
     assert_eq!(motion.map_from_ego(0), None);
-    motion.push_pose(&pose(0, at(10.0, 0.0, 3.0)));
-    motion.push_pose(&pose(100_000_000, at(11.0, 2.0, -3.0)));
+    motion.push_pose(&pose(0, at(10.0, 0.0, 3.0)), 0);
+    motion.push_pose(&pose(100_000_000, at(11.0, 2.0, -3.0)), 0);
     assert_eq!(motion.map_from_ego(0), Some(at(10.0, 0.0, 3.0)), "a pose's own stamp gives the pose, to the bit");
     let quarter = motion.map_from_ego(25_000_000).unwrap();
     // From 3 to -3 rad the shorter rotation passes π.
@@ -50,10 +50,10 @@ fn between_poses_translation_is_linear_and_rotation_a_slerp() {
 #[test]
 fn beyond_the_poses_the_motion_continues_for_a_limited_time() {
     let mut motion = Motion::new(&MotionConfig::default());
-    motion.push_pose(&pose(0, at(0.0, 0.0, 0.0)));
+    motion.push_pose(&pose(0, at(0.0, 0.0, 0.0)), 0);
     let alone = motion.map_from_ego(100_000_000).unwrap();
     assert!((alone.translation.x - 1.5).abs() < 1e-12, "one pose continues with its own speed: {alone}");
-    motion.push_pose(&pose(100_000_000, at(1.0, 0.5, 0.1)));
+    motion.push_pose(&pose(100_000_000, at(1.0, 0.5, 0.1)), 0);
     let later = motion.map_from_ego(300_000_000).unwrap();
     assert!((later.translation.vector - Vector3::new(3.0, 1.5, 0.0)).norm() < 1e-12, "{later}");
     assert!((later.rotation.euler_angles().2 - 0.3).abs() < 1e-12);
@@ -61,14 +61,14 @@ fn beyond_the_poses_the_motion_continues_for_a_limited_time() {
     let earlier = motion.map_from_ego(-200_000_000).unwrap();
     assert!((earlier.translation.vector - Vector3::new(-2.0, -1.0, 0.0)).norm() < 1e-12, "{earlier}");
     assert_eq!(motion.map_from_ego(-200_000_001), None);
-    motion.push_pose(&pose(1_200_000_001, at(9.0, 9.0, 0.0)));
+    motion.push_pose(&pose(1_200_000_001, at(9.0, 9.0, 0.0)), 0);
     assert_eq!(motion.map_from_ego(700_000_000), None, "poses more than a second apart are not interpolated");
 }
 
 #[test]
 fn only_the_newest_thousand_poses_are_kept() {
     let mut motion = Motion::new(&MotionConfig::default());
-    (0..5000).for_each(|i| motion.push_pose(&pose(i * 1_000_000, at(i as f64, 0.0, 0.0))));
+    (0..5000).for_each(|i| motion.push_pose(&pose(i * 1_000_000, at(i as f64, 0.0, 0.0)), 0));
     assert_eq!(motion.map_from_ego(3_975_000_000 - 200_000_000), None);
     assert!((motion.map_from_ego(4_500_500_000).unwrap().translation.x - 4500.5).abs() < 1e-9);
 }
@@ -278,7 +278,7 @@ fn extreme_stamps_and_positions_move_no_point() {
     assert!(made.len() >= 2 && made.iter().all(|compensation| *compensation == Compensation::None));
     let motion = |stamps: [i64; 2]| {
         let mut motion = Motion::new(&MotionConfig::default());
-        stamps.into_iter().for_each(|stamp_ns| motion.push_pose(&far(stamp_ns, 1.0)));
+        stamps.into_iter().for_each(|stamp_ns| motion.push_pose(&far(stamp_ns, 1.0), 0));
         motion
     };
     for stamps in [[i64::MIN, i64::MAX], [i64::MIN, 0], [0, i64::MAX]] {
@@ -319,8 +319,8 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     };
     let revolution = SimulatedVehicle::new(vehicle().scene().clone(), config).revolution(1);
     let mut motion = Motion::new(&MotionConfig::default());
-    motion.push_pose(&pose(revolution.start_ns, at(0.0, 0.0, 0.0)));
-    motion.push_pose(&pose(revolution.end_ns, at(1.5, 0.0, 0.0)));
+    motion.push_pose(&pose(revolution.start_ns, at(0.0, 0.0, 0.0)), 0);
+    motion.push_pose(&pose(revolution.end_ns, at(1.5, 0.0, 0.0)), 0);
     let mut trajectory = EgoTrajectory::default();
     motion.follow_revolution(&revolution, &mut trajectory);
     let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };

@@ -7,7 +7,7 @@ use clearway_ros::OccupancyGrid;
 use clearway_ros::cdr::Header;
 use clearway_ros::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
-use clearway_ros::pose::{Odometry, StampedTransform, pose_array_to_cdr, tf_message_to_cdr};
+use clearway_ros::pose::{Odometry, StampedTransform, Twist, pose_array_to_cdr, tf_message_to_cdr};
 use nalgebra::Isometry3;
 
 use super::frame::{MAP_FRAME, base_frame, map_from_ego};
@@ -56,7 +56,8 @@ pub fn tf(map: &MapView) -> Option<Vec<u8>> {
 pub fn odometry(map: &MapView) -> Option<Vec<u8>> {
     let forward_mps = map.header().speed_mps.unwrap_or_default();
     with_transform(map, |transform| {
-        Odometry { transform, linear_mps: [forward_mps, 0.0, 0.0], angular_rps: [0.0; 3] }.to_cdr()
+        let twist = Some(Twist { linear_mps: [forward_mps, 0.0, 0.0], angular_rps: [0.0; 3] });
+        Odometry { transform, twist }.to_cdr()
     })
 }
 

@@ -1,18 +1,15 @@
 //! One pcap or pcapng file -> readings with the capture's stamps.
 //!
-//! A capture may have packets of several sensors; a replay uses one of them: the sender of the first data packet. Data
-//! packets and telemetry of other senders are ignored and counted. Any other datagram becomes a reading as a live one
-//! does, and the core refuses it with a reason.
+//! A capture may have packets of several sensors; a replay uses one of them, as [`CaptureSensor`] chooses. Data packets
+//! and telemetry of other senders are ignored and counted. Any other datagram becomes a reading as a live one does, and
+//! the core refuses it with a reason.
 
-use std::collections::BTreeMap;
 use std::io::BufReader;
-use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use clearway_lidar::capture::{Capture, CaptureError as Error};
-use clearway_lidar::packet::PACKET_LENGTH;
-use clearway_lidar::telemetry::TELEMETRY_LENGTH;
+use clearway_lidar::capture_sensor::CaptureSensor;
 use clearway_mapping::event::Body;
 
 use crate::base::file_advice::open_to_read;
@@ -43,8 +40,7 @@ pub enum CaptureError {
 pub struct Source {
     file: PathBuf,
     capture: Capture<'static>,
-    sensor: Option<IpAddr>,
-    others: BTreeMap<IpAddr, u64>,
+    sensor: CaptureSensor,
     truncated: Option<String>,
 }
 
@@ -57,7 +53,7 @@ impl Source {
         let open = open_to_read(file).map_err(|source| CaptureError::Open { file: file.to_owned(), source })?;
         let capture = Capture::new(BufReader::new(open));
         let capture = capture.map_err(|source| CaptureError::Read { file: file.to_owned(), source })?;
-        Ok(Self { file: file.to_owned(), capture, sensor: None, others: BTreeMap::new(), truncated: None })
+        Ok(Self { file: file.to_owned(), capture, sensor: CaptureSensor::default(), truncated: None })
     }
 
     /// Number of bytes read, in whole packets.
@@ -72,15 +68,7 @@ impl Source {
 
     /// The datagrams and packets that were ignored, and why, for people.
     pub fn notes(&self) -> Vec<String> {
-        let others =
-            self.others.iter().map(|(sender, n)| format!("{n} datagrams of another sensor, {sender}, ignored"));
-        let skipped = self.capture.skipped();
-        let skipped = [
-            (skipped.not_udp, "packets that are not UDP ignored"),
-            (skipped.fragmented, "pieces of fragmented datagrams ignored"),
-            (skipped.unreadable, "unreadable packets ignored"),
-        ];
-        others.chain(skipped.into_iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!("{n} {what}"))).collect()
+        self.sensor.notes().into_iter().chain(self.capture.skipped().notes()).collect()
     }
 }
 
@@ -97,14 +85,7 @@ impl Iterator for Source {
                 }
                 Err(source) => return Some(Err(CaptureError::Read { file: self.file.clone(), source })),
             };
-            let sender = datagram.source.ip();
-            let length = datagram.payload.len();
-            if length == PACKET_LENGTH {
-                self.sensor.get_or_insert(sender);
-            }
-            let is_of_sensor = length == PACKET_LENGTH || length == TELEMETRY_LENGTH;
-            if is_of_sensor && self.sensor.is_some_and(|sensor| sensor != sender) {
-                *self.others.entry(sender).or_default() += 1;
+            if !self.sensor.has_sent(&datagram) {
                 continue;
             }
             let body = Body::Datagram(Bytes::from(datagram.payload));

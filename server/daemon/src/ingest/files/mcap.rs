@@ -4,11 +4,15 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 
+use super::pose_gap::PoseGap;
+use super::unread_topics::unread_topics;
 use crate::base::counted::counted;
 use crate::ingest::queue::Reading;
-use crate::ingest::ros::choice::{AvailableTopics, ChoiceError};
+use crate::ingest::ros::available::AvailableTopics;
+use crate::ingest::ros::choice::ChoiceError;
 use crate::ingest::ros::decoder::TopicDecoder;
 use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
+use clearway_ros::RefusedPart;
 
 /// Number of refused messages that are not reported to the event queue yet, by sensor and reason.
 pub type RefusedMessages = BTreeMap<(u16, &'static str), u64>;
@@ -37,7 +41,10 @@ pub struct Source {
     /// By topic: the number of refused messages, and the fault of the first.
     refused_topics: BTreeMap<String, (u64, String)>,
     refused: RefusedMessages,
+    /// By topic and kind of part: the number of refused parts of used messages, and the fault of the first.
+    refused_parts: BTreeMap<(String, &'static str), (u64, String)>,
     waiting: VecDeque<Reading>,
+    pose_gap: PoseGap,
     is_journal: bool,
     /// Sequence of the event after the newest one of the journal.
     next_event: u64,
@@ -87,7 +94,7 @@ impl Source {
         if recording.header().config.is_some() {
             decoder = None;
         } else if decoder.is_none() {
-            let choice = AvailableTopics::from_file(file)?.choose(file, &options.topics, options.sensors_max)?;
+            let choice = AvailableTopics::from_file(file)?.choose(&options.topics, options.sensors_max)?;
             notes.clone_from(&choice.notes);
             decoder = Some(choice.decoder());
         }
@@ -99,7 +106,9 @@ impl Source {
             ignored: BTreeSet::new(),
             refused_topics: BTreeMap::new(),
             refused: RefusedMessages::new(),
+            refused_parts: BTreeMap::new(),
             waiting: VecDeque::new(),
+            pose_gap: PoseGap::default(),
             is_journal: false,
             next_event,
         })
@@ -121,7 +130,14 @@ impl Source {
         let refused = self.refused_topics.iter();
         let refused = refused
             .map(|(topic, (n, first))| format!("{topic}: {} refused, the first: {first}", counted(*n, "message")));
-        self.notes.iter().cloned().chain(ignored).chain(refused).collect()
+        let parts = self.refused_parts.iter().map(|((topic, what), (n, first))| {
+            format!("{topic}: {n} {what} of messages refused and the rest used, the first: {first}")
+        });
+        // A journal was made of readings whose gap was told then.
+        let topic_of = |source| self.decoder.as_ref().and_then(|of| of.topic(source)).unwrap_or("a sensor").to_owned();
+        let gaps = if self.is_journal { Vec::new() } else { self.pose_gap.notes(topic_of) };
+        let unread = if self.decoder.is_some() { unread_topics(&self.recording.channels()) } else { Vec::new() };
+        self.notes.iter().cloned().chain(ignored).chain(refused).chain(parts).chain(gaps).chain(unread).collect()
     }
 
     /// Returns the refused messages since the last call.
@@ -156,9 +172,17 @@ impl Source {
                 let Some(decoder) = self.decoder.as_mut().filter(|decoder| decoder.accepts(&topic, kind)) else {
                     return;
                 };
-                if let Err(error) = decoder.decode(&topic, kind, log_ns, &bytes, &mut self.waiting) {
-                    *self.refused.entry((decoder.source(&topic), error.reason())).or_default() += 1;
-                    self.refused_topics.entry(topic).or_insert_with(|| (0, error.to_string())).0 += 1;
+                match decoder.decode(&topic, kind, log_ns, &bytes, &mut self.waiting) {
+                    Ok(parts) => {
+                        for RefusedPart { what, count, fault } in parts {
+                            let of_topic = self.refused_parts.entry((topic.clone(), what));
+                            of_topic.or_insert_with(|| (0, fault.to_string())).0 += count;
+                        }
+                    }
+                    Err(error) => {
+                        *self.refused.entry((decoder.source(&topic), error.reason())).or_default() += 1;
+                        self.refused_topics.entry(topic).or_insert_with(|| (0, error.to_string())).0 += 1;
+                    }
                 }
             }
             RecordedMessage::Map { .. }
@@ -175,6 +199,7 @@ impl Iterator for Source {
     fn next(&mut self) -> Option<Self::Item> {
         loop {
             if let Some(reading) = self.waiting.pop_front() {
+                self.pose_gap.note(&reading);
                 return Some(Ok(reading));
             }
             match self.recording.next()? {

@@ -8,6 +8,8 @@
 //! |---|---|
 //! | [`capture`] | pcap, pcapng -> readings |
 //! | [`mcap`] | recording or ROS 2 bag, in MCAP or sqlite -> readings |
+//! | `unread_topics` | channels of a bag -> what is not read of them, and what helps |
+//! | `pose_gap` | readings -> how far scans are from poses |
 //! | [`ground_revolutions`] | revolutions -> the points from which a mount is estimated |
 //! | [`kitti`] | one scan, `.bin`, `.pcd.bin` or `.pcd` -> reading |
 
@@ -15,6 +17,8 @@ pub mod capture;
 pub mod ground_revolutions;
 pub mod kitti;
 pub mod mcap;
+mod pose_gap;
+mod unread_topics;
 
 use std::collections::{BTreeSet, VecDeque};
 use std::io::{Error, ErrorKind, Read};
@@ -28,6 +32,9 @@ use crate::ingest::queue::Reading;
 use capture::CaptureError;
 use kitti::ScanError;
 use mcap::{Before, McapError, McapOptions, RefusedMessages};
+
+/// Greatest time by which the files of a split bag overlap, in ns. Ours: recorders write what they have buffered.
+const SPLIT_OVERLAP_NS_MAX: i64 = 5_000_000_000;
 
 /// The kind of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -57,6 +64,16 @@ pub enum FilesError {
         /// The file or folder.
         file: PathBuf,
     },
+    /// A file can be read after it is converted.
+    #[error("{}: {what}: {advice}", file.display())]
+    Converted {
+        /// The file.
+        file: PathBuf,
+        /// What it is.
+        what: &'static str,
+        /// The command that converts it.
+        advice: String,
+    },
     /// A folder has no file of a known kind.
     #[error("{}: no pcap, pcapng, mcap, db3, bin or pcd file in this folder", file.display())]
     Empty {
@@ -66,7 +83,7 @@ pub enum FilesError {
     /// A file of a vehicle begins before the file before it has ended.
     #[error(
         "{}: it begins {overlap_s:.3} s before the end of the file before it; give the files of one vehicle in the \
-         order of their times, without overlap",
+         order of their times, without overlap, and each drive in one format",
         file.display()
     )]
     Overlap {
@@ -115,6 +132,8 @@ pub struct Readings {
     has_ended: bool,
     /// True until the first reading of the open file.
     is_file_new: bool,
+    /// Stamp of the first reading of the open file.
+    file_began_ns: i64,
 }
 
 enum Open {
@@ -151,6 +170,7 @@ impl Readings {
             notes: Vec::new(),
             has_ended: false,
             is_file_new: false,
+            file_began_ns: i64::MIN,
         })
     }
 
@@ -236,16 +256,23 @@ impl Readings {
         }
     }
 
-    /// Refuses a file whose first reading is older than the last of the file before. Bags of ROS 2 may overlap a
-    /// little.
+    /// Refuses a file whose first reading is older than the last of the file before. The files of a split bag may
+    /// overlap a little; one that begins no later than the file before it has the same drive.
     fn check_overlap(&mut self, reading: &Reading, is_journal: bool) -> Result<(), FilesError> {
-        let file = match &self.open {
-            Some(Open::Capture(file, _)) => file,
-            Some(Open::Mcap(file, _)) if is_journal => file,
+        let (file, is_bag) = match &self.open {
+            Some(Open::Capture(file, _)) => (file, false),
+            Some(Open::Mcap(file, _)) => (file, !is_journal),
             _ => return Ok(()),
         };
         let newest_ns = self.pending_ends.0;
-        if std::mem::take(&mut self.is_file_new) && reading.arrival_ns < newest_ns {
+        if !std::mem::take(&mut self.is_file_new) {
+            return Ok(());
+        }
+        let began_ns = std::mem::replace(&mut self.file_began_ns, reading.arrival_ns);
+        let may_overlap = is_bag
+            && reading.arrival_ns > began_ns
+            && newest_ns.saturating_sub(reading.arrival_ns) <= SPLIT_OVERLAP_NS_MAX;
+        if reading.arrival_ns < newest_ns && !may_overlap {
             let overlap_s = (newest_ns - reading.arrival_ns) as f64 * 1e-9;
             return Err(FilesError::Overlap { file: file.clone(), overlap_s });
         }
@@ -327,7 +354,25 @@ pub fn kind(file: &Path) -> Result<Kind, FilesError> {
         let source = Error::new(ErrorKind::UnexpectedEof, "the file is empty");
         return Err(FilesError::Open { file: file.to_owned(), source });
     }
-    by_name.ok_or_else(|| FilesError::Kind { file: file.to_owned() })
+    let by_name = by_name.ok_or_else(|| FilesError::Kind { file: file.to_owned() });
+    conversion(file, &magic).map_or(by_name, Err)
+}
+
+/// The error of a file that can be read after it is converted.
+fn conversion(file: &Path, magic: &[u8]) -> Option<FilesError> {
+    let name = file.display();
+    let (what, advice) = match magic {
+        [0x28, 0xb5, 0x2f, 0xfd, ..] => ("compressed with zstd as a whole", format!("`zstd -d {name}` first")),
+        [0x1f, 0x8b, ..] => ("compressed with gzip", format!("`gunzip -k {name}` first")),
+        [0x04, 0x22, 0x4d, 0x18, ..] => ("compressed with lz4 as a whole", format!("`lz4 -d {name}` first")),
+        [b'P', b'K', 3, 4, ..] => ("a zip archive", format!("`unzip {name}` first")),
+        [b'B', b'Z', b'h', ..] => ("compressed with bzip2", format!("`bunzip2 -k {name}` first")),
+        _ if magic.starts_with(b"#ROSBAG ") => {
+            ("a ROS 1 bag", format!("`rosbags-convert --src {name} --dst ros2_bag` first"))
+        }
+        _ => return None,
+    };
+    Some(FilesError::Converted { file: file.to_owned(), what, advice })
 }
 
 fn kind_by_name(file: &Path) -> Option<Kind> {
@@ -341,12 +386,19 @@ fn kind_by_name(file: &Path) -> Option<Kind> {
 
 fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
     let open = |source| FilesError::Open { file: folder.to_owned(), source: advised(folder, source) };
-    let mut files = Vec::new();
+    let (mut files, mut to_convert) = (Vec::new(), None);
     for entry in std::fs::read_dir(folder).map_err(open)? {
         let file = entry.map_err(open)?.path();
         if file.is_file() && kind_by_name(&file).is_some() {
             files.push((file.clone(), kind(&file)?));
+        } else if file.is_file()
+            && let Err(error @ FilesError::Converted { .. }) = kind(&file)
+        {
+            to_convert = to_convert.or(Some(error));
         }
+    }
+    if let Some(error) = to_convert.filter(|_| files.is_empty()) {
+        return Err(error);
     }
     if files.is_empty() {
         return Err(FilesError::Empty { file: folder.to_owned() });

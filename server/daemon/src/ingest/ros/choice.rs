@@ -1,22 +1,24 @@
 //! Chooses the topics of an MCAP file to decode: the requested topics, or the sensors and the best poses in the file.
+//!
+//! Where the file states a mount and the transform was refused, no mount is guessed: the sensor has the reason.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use clearway_ros::frames::name;
-use clearway_ros::pose::{Odometry, tf_message};
-use clearway_ros::velodyne_scan::VelodyneScan;
-use clearway_ros::{Frames, Kind, PointCloud2};
-use nalgebra::Isometry3;
+use clearway_ros::frames::local_name;
+use clearway_ros::{Frames, Kind};
+use nalgebra::{Isometry3, Translation3};
 
+use super::available::{AvailableTopics, Topic};
 use super::decoder::{PoseSource, TopicDecoder};
-use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
+use clearway_journal::reader::RecordingError;
 
-/// Duration of the start of a file from which its topics are known, in ns. Ours: latched transforms come first, all
-/// other messages come often.
-const START_NS: i64 = 10_000_000_000;
-/// The vehicle's frame: the first of these in the tf tree. REP-120 puts `base_footprint` on the ground.
+/// The vehicle's frame: the first of these in the tf tree, with or without a namespace. REP-120 puts `base_footprint`
+/// on the ground.
 const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
+/// Height over the ground from which a cloud in the vehicle's frame is taken to be seen, in metres. Ours, about the roof
+/// of a car.
+pub(super) const RAISED_M: f64 = 2.0;
 /// Plausible heights of a sensor above the ground, in metres. A transform with another height belongs to an ego frame
 /// that is not on the ground.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.1..=20.0;
@@ -30,7 +32,7 @@ pub enum ChoiceError {
     #[error(transparent)]
     Recording(#[from] RecordingError),
     /// The file does not have a requested topic.
-    #[error("{}: --topic {topic}: the file has, in its first 10 s: {known}", file.display())]
+    #[error("{}: --topic {topic}: the file has: {known}", file.display())]
     Topic {
         /// The file.
         file: PathBuf,
@@ -39,26 +41,6 @@ pub enum ChoiceError {
         /// The topics of the file, with their types.
         known: String,
     },
-}
-
-/// The topics of an MCAP file that can be decoded.
-#[derive(Clone, Debug, Default)]
-pub struct AvailableTopics {
-    topics: BTreeMap<String, Topic>,
-    /// The newest transforms of all frames.
-    frames: Frames,
-    /// The static transforms.
-    latched: Frames,
-}
-
-#[derive(Clone, Debug)]
-struct Topic {
-    kind: Kind,
-    /// Frame of a sensor's points, or child frame of an odometry; of the first readable message.
-    frame_id: Option<String>,
-    points: u64,
-    /// Index of the topic in the order of their first messages.
-    order: usize,
 }
 
 /// The topic of a sensor.
@@ -71,6 +53,10 @@ pub struct SensorTopic {
     /// The sensor's pose on the vehicle, from tf; `None` if no chain of transforms gives it, or if its height is
     /// implausible.
     pub ego_from_sensor: Option<Isometry3<f64>>,
+    /// Why a transform that states the pose was refused.
+    pub refused_mount: Option<String>,
+    /// True for a cloud in the vehicle's frame: it is taken to be seen from 2 m over the origin.
+    pub is_merged: bool,
 }
 
 /// The chosen topics.
@@ -88,86 +74,34 @@ pub struct TopicChoice {
 }
 
 impl AvailableTopics {
-    /// Reads the topics from the first 10 s of a file.
-    ///
-    /// # Errors
-    /// [`RecordingError`] if the file cannot be read or is damaged there.
-    pub fn from_file(file: &Path) -> Result<Self, RecordingError> {
-        let mut available = Self::default();
-        let mut first_ns = None;
-        for message in RecordingReader::open(file)? {
-            let RecordedMessage::Ros { topic, kind, log_ns, bytes } = message? else { continue };
-            if log_ns.saturating_sub(*first_ns.get_or_insert(log_ns)) > START_NS {
-                break;
-            }
-            available.insert(topic, kind, &bytes);
-        }
-        Ok(available)
-    }
-
-    fn insert(&mut self, topic: String, kind: Kind, bytes: &[u8]) {
-        let (order, are_static) = (self.topics.len(), topic.ends_with("tf_static"));
-        let found = self.topics.entry(topic).or_insert(Topic { kind, frame_id: None, points: 0, order });
-        // An unreadable message is counted and reported when it is decoded.
-        match kind {
-            Kind::TfMessage => {
-                for transform in tf_message(bytes).unwrap_or_default() {
-                    self.frames.insert(&transform);
-                    if are_static {
-                        self.latched.insert(&transform);
-                    }
-                }
-            }
-            _ if found.frame_id.is_some() => {}
-            Kind::PointCloud2 => {
-                if let Ok(cloud) = PointCloud2::new(bytes) {
-                    found.frame_id = Some(name(cloud.header.frame_id).to_owned());
-                    found.points = u64::from(cloud.width) * u64::from(cloud.height);
-                }
-            }
-            Kind::VelodyneScan => {
-                found.frame_id = VelodyneScan::new(bytes).ok().map(|scan| name(scan.header.frame_id).to_owned());
-            }
-            Kind::Odometry => {
-                found.frame_id = Odometry::new(bytes).ok().map(|o| name(o.transform.child_frame_id).to_owned());
-            }
-            Kind::PoseStamped => {}
-        }
-    }
-
     /// Chooses the topics to decode: of the `requested` topics all sensors, in this order, and the first with poses. If
     /// no requested topic is a sensor, or none has poses, the choice is made here. Sensors: one topic a frame, packets
-    /// before points, then the cloud with the most points; a cloud in the vehicle's frame or in a fixed frame is left
-    /// out, because another program has merged it. Poses: an odometry, else the tf chain from `map`, else from `odom`,
-    /// else stamped poses.
+    /// before points, then the cloud with the most points; a cloud in the vehicle's frame or in a fixed frame has been
+    /// merged by another program, and one in the vehicle's frame is used only if there is no other. Poses: an odometry,
+    /// else the tf chain from `map`, else from `odom`, else stamped poses.
     ///
     /// # Errors
     /// [`ChoiceError::Topic`] if the file does not have a requested topic.
-    pub fn choose(&self, file: &Path, requested: &[String], sensors_max: usize) -> Result<TopicChoice, ChoiceError> {
+    pub fn choose(&self, requested: &[String], sensors_max: usize) -> Result<TopicChoice, ChoiceError> {
         for topic in requested {
             if !self.topics.contains_key(topic) {
                 let known = self.topics.iter().map(|(topic, of)| format!("{topic} ({})", of.kind));
                 let known = known.collect::<Vec<_>>().join(", ");
-                return Err(ChoiceError::Topic { file: file.to_owned(), topic: topic.clone(), known });
+                return Err(ChoiceError::Topic { file: self.file.clone(), topic: topic.clone(), known });
             }
         }
         let kind = |topic: &String| self.topics[topic].kind;
-        let ego_frame = EGO_FRAMES.into_iter().find(|frame| self.frames.contains(frame)).unwrap_or("base_link");
+        let ego_frame = self.ego_frame();
         let mut sensors: Vec<&String> = requested.iter().filter(|topic| kind(topic).is_sensor()).collect();
-        if sensors.is_empty() {
-            sensors = self.best_sensors(ego_frame);
+        let is_requested = !sensors.is_empty();
+        if !is_requested {
+            sensors = self.best_sensors();
         }
         sensors.truncate(sensors_max);
         let pose = requested.iter().find(|topic| matches!(kind(topic), Kind::Odometry | Kind::PoseStamped));
-        let pose = pose.map(|topic| PoseSource::Topic(topic.clone())).or_else(|| self.best_pose(ego_frame));
-        let sensor_topic = |topic: &&String| {
-            let frame_id = self.topics[*topic].frame_id.clone().unwrap_or_default();
-            let ego_from_sensor = self.frames.a_from_b(ego_frame, &frame_id);
-            let ego_from_sensor = ego_from_sensor.filter(|pose| HEIGHTS_M.contains(&pose.translation.z));
-            SensorTopic { topic: (*topic).clone(), frame_id, ego_from_sensor }
-        };
-        let is_requested = requested.iter().any(|topic| kind(topic).is_sensor());
-        let mut sensors: Vec<SensorTopic> = sensors.iter().map(sensor_topic).collect();
+        let pose = pose.map(|topic| PoseSource::Topic(topic.clone())).or_else(|| self.best_pose(&ego_frame));
+        let mut sensors: Vec<SensorTopic> =
+            sensors.into_iter().map(|topic| self.sensor_topic(topic, &ego_frame)).collect();
         if !is_requested && sensors.iter().all(|sensor| sensor.ego_from_sensor.is_none()) {
             // A replay can use one sensor that is not placed: the one that shows most, whichever sent first.
             let shown = |sensor: &SensorTopic| {
@@ -176,17 +110,50 @@ impl AvailableTopics {
             };
             sensors.sort_by_key(|sensor| std::cmp::Reverse(shown(sensor)));
         }
-        let notes = self.describe(&sensors, pose.as_ref(), ego_frame);
-        Ok(TopicChoice { sensors, pose, ego_frame: ego_frame.to_owned(), notes, latched: self.latched.clone() })
+        let notes = self.describe(&sensors, pose.as_ref(), &ego_frame);
+        Ok(TopicChoice { sensors, pose, ego_frame, notes, latched: self.latched.clone() })
     }
 
-    fn best_sensors(&self, ego_frame: &str) -> Vec<&String> {
-        let is_merged =
-            |frame: &str| frame == ego_frame || EGO_FRAMES.contains(&frame) || FIXED_FRAMES.contains(&frame);
+    /// The vehicle's frame: of those in the tf tree the one to which the frame of a sensor is joined; without tf the
+    /// child frame of the first odometry, else `base_link`.
+    fn ego_frame(&self) -> String {
+        let names = self.frames.names();
+        let candidates: Vec<&str> = EGO_FRAMES
+            .into_iter()
+            .flat_map(|ego| names.get(ego).into_iter().chain(names.iter().filter(move |name| local_name(name) == ego)))
+            .copied()
+            .collect();
+        let is_joined = |ego: &&&str| {
+            let mut frames =
+                self.topics.values().filter(|of| of.kind.is_sensor()).filter_map(|of| of.frame_id.as_ref());
+            frames.any(|frame| self.frames.a_from_b(ego, frame).is_some())
+        };
+        let found = candidates.iter().find(is_joined).or(candidates.first());
+        let of_odometry = || {
+            let odometries = self.topics.values().filter(|of| of.kind == Kind::Odometry);
+            odometries.min_by_key(|of| of.order)?.frame_id.as_deref().filter(|frame| !frame.is_empty())
+        };
+        found.copied().or_else(of_odometry).unwrap_or("base_link").to_owned()
+    }
+
+    fn sensor_topic(&self, topic: &str, ego_frame: &str) -> SensorTopic {
+        let frame_id = self.topics[topic].frame_id.clone().unwrap_or_default();
+        let is_merged = is_ego(&frame_id);
+        let ego_from_sensor = if is_merged {
+            Some(Translation3::new(0.0, 0.0, RAISED_M).into())
+        } else {
+            let of_tf = self.frames.a_from_b(ego_frame, &frame_id);
+            of_tf.filter(|pose| HEIGHTS_M.contains(&pose.translation.z))
+        };
+        let refused_mount = self.refused_mount(&frame_id).filter(|_| ego_from_sensor.is_none());
+        SensorTopic { topic: topic.to_owned(), frame_id, ego_from_sensor, refused_mount, is_merged }
+    }
+
+    fn best_sensors(&self) -> Vec<&String> {
         let mut best: BTreeMap<&str, (&String, &Topic)> = BTreeMap::new();
         for (topic, found) in self.topics.iter().filter(|(_, found)| found.kind.is_sensor()) {
             let frame = found.frame_id.as_deref().unwrap_or_default();
-            if is_merged(frame) {
+            if is_fixed(frame) {
                 continue;
             }
             let rank = |of: &Topic| (of.kind == Kind::VelodyneScan, of.points, usize::MAX - of.order);
@@ -194,6 +161,9 @@ impl AvailableTopics {
             if rank(found) > rank(best_of_frame.1) {
                 *best_of_frame = (topic, found);
             }
+        }
+        if best.keys().any(|frame| !is_ego(frame)) {
+            best.retain(|frame, _| !is_ego(frame));
         }
         let mut best: Vec<_> = best.into_values().collect();
         best.sort_by_key(|(_, found)| found.order);
@@ -205,42 +175,102 @@ impl AvailableTopics {
             let of_kind = self.topics.iter().filter(|(_, found)| found.kind == kind && fits(found));
             of_kind.min_by_key(|(_, found)| found.order).map(|(topic, _)| PoseSource::Topic(topic.clone()))
         };
-        let is_joined = |found: &Topic| {
-            found.frame_id.as_deref().is_some_and(|frame| self.frames.a_from_b(frame, ego_frame).is_some())
-        };
-        let mut fixed = FIXED_FRAMES.into_iter().filter(|fixed| self.frames.a_from_b(fixed, ego_frame).is_some());
+        let is_joined = |found: &Topic| self.is_joined(found, ego_frame);
+        // A fixed frame with or without a namespace.
+        let mut fixed = FIXED_FRAMES.into_iter().filter_map(|fixed| {
+            let is_above = |name: &&str| local_name(name) == fixed && self.frames.a_from_b(name, ego_frame).is_some();
+            self.frames.names().into_iter().find(is_above)
+        });
         first(Kind::Odometry, &is_joined)
             .or_else(|| fixed.next().map(|fixed| PoseSource::Frames { fixed: fixed.to_owned() }))
             .or_else(|| first(Kind::PoseStamped, &|_| true))
     }
 
+    /// True if the child frame of an odometry is the vehicle's or is joined to it. An empty one is the vehicle's.
+    fn is_joined(&self, odometry: &Topic, ego_frame: &str) -> bool {
+        let is_joined = |frame: &str| frame.is_empty() || self.frames.a_from_b(frame, ego_frame).is_some();
+        odometry.frame_id.as_deref().is_some_and(is_joined)
+    }
+
     fn describe(&self, sensors: &[SensorTopic], pose: Option<&PoseSource>, ego_frame: &str) -> Vec<String> {
         let mut notes = Vec::new();
         let mut used: BTreeSet<&str> = BTreeSet::new();
-        for SensorTopic { topic, frame_id, ego_from_sensor } in sensors {
+        for sensor in sensors {
+            let SensorTopic { topic, frame_id, ego_from_sensor, refused_mount, is_merged } = sensor;
             used.insert(topic);
-            notes.push(match ego_from_sensor {
-                Some(_) => format!("{topic} is used; tf places its frame {frame_id}"),
-                None => format!("{topic} is used; tf does not place its frame {frame_id} 0.1 to 20 m over {ego_frame}"),
+            let found = &self.topics[topic];
+            notes.push(match (ego_from_sensor, refused_mount, &found.refused) {
+                (_, _, Some((_, first))) if found.frame_id.is_none() => {
+                    format!("{topic} is read, but none of its first messages can be: {first}")
+                }
+                (Some(_), ..) if *is_merged => format!(
+                    "{topic} is used; its frame {frame_id} is the vehicle's, so another program has moved its points: \
+                     rays are taken to begin {RAISED_M} m over the origin and are approximate"
+                ),
+                (Some(_), ..) => format!("{topic} is used; tf places its frame {frame_id}"),
+                (None, Some(refused), _) => {
+                    format!("{topic} is read; the transform that places its frame {frame_id} was refused: {refused}")
+                }
+                _ => format!("{topic} is used; tf does not place its frame {frame_id} 0.1 to 20 m over {ego_frame}"),
             });
         }
         match pose {
             Some(PoseSource::Topic(topic)) => {
                 used.insert(topic);
-                notes.push(format!("{topic} is used for poses of {ego_frame}"));
+                let is_unnamed = self.topics[topic].kind == Kind::Odometry
+                    && self.topics[topic].frame_id.as_ref().is_some_and(String::is_empty);
+                let taken = if is_unnamed { "; its child_frame_id is empty and taken as this frame" } else { "" };
+                notes.push(format!("poses of {ego_frame} are read from {topic}{taken}"));
             }
             Some(PoseSource::Frames { fixed }) => {
-                notes.push(format!("tf is used for poses of {ego_frame} in {fixed}"));
+                notes.push(format!("poses of {ego_frame} are read from tf, in {fixed}"))
             }
             None if sensors.is_empty() => {}
-            None => notes.push("the file has no poses".into()),
+            None => notes.push("no poses are read".into()),
         }
         let unused =
             |(topic, found): &(&String, &Topic)| !used.contains(topic.as_str()) && found.kind != Kind::TfMessage;
         let unused = self.topics.iter().filter(unused);
-        notes.extend(unused.map(|(topic, found)| format!("{topic} ({}) is not used", found.kind)));
+        notes.extend(unused.map(|(topic, found)| {
+            let why = self.why_unused(found, sensors, ego_frame);
+            format!("{topic} ({}) is not used: {why}", found.kind)
+        }));
         notes
     }
+
+    fn why_unused(&self, found: &Topic, sensors: &[SensorTopic], ego_frame: &str) -> String {
+        let frame = found.frame_id.as_deref().unwrap_or_default();
+        match (found.kind, &found.refused) {
+            (_, Some((_, first))) if found.frame_id.is_none() => {
+                format!("none of its first messages can be read: {first}")
+            }
+            (kind, _) if kind.is_sensor() && sensors.iter().any(|sensor| sensor.frame_id == frame) => {
+                format!("another topic has the frame {frame} and shows more")
+            }
+            (kind, _) if kind.is_sensor() && is_ego(frame) => {
+                format!("its frame {frame} is the vehicle's, so it was merged from other sensors; --topic uses it")
+            }
+            (kind, _) if kind.is_sensor() && is_fixed(frame) => {
+                format!("its frame {frame} does not move with the vehicle")
+            }
+            (kind, _) if kind.is_sensor() => match self.refused_mount(frame) {
+                Some(fault) => format!("the transform that places its frame {frame} was refused: {fault}"),
+                None => format!("tf does not place its frame {frame}; --topic with --extrinsics uses it"),
+            },
+            (Kind::Odometry, _) if !self.is_joined(found, ego_frame) => {
+                format!("no transform joins its child frame {frame} to {ego_frame}")
+            }
+            _ => "poses come from another topic".to_owned(),
+        }
+    }
+}
+
+fn is_ego(frame: &str) -> bool {
+    EGO_FRAMES.contains(&local_name(frame))
+}
+
+fn is_fixed(frame: &str) -> bool {
+    FIXED_FRAMES.contains(&local_name(frame))
 }
 
 impl TopicChoice {
@@ -248,6 +278,7 @@ impl TopicChoice {
     /// earlier messages.
     pub fn decoder(&self) -> TopicDecoder {
         let sensors = self.sensors.iter().zip(0..).map(|(sensor, index)| (sensor.topic.clone(), index)).collect();
-        TopicDecoder::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone())
+        let merged = self.sensors.iter().filter(|sensor| sensor.is_merged).map(|sensor| sensor.topic.clone());
+        TopicDecoder::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone()).lowering(merged.collect())
     }
 }

@@ -2,19 +2,22 @@
 //!
 //! Scans come in the sensor's frame, and the sensor's extrinsics place them on the vehicle. Ego poses come from an
 //! odometry, from stamped poses, or from the tf chain of a fixed frame down to the vehicle's frame. If a message refers
-//! to another frame than the vehicle's, the tf tree transforms it; a missing chain is an error. tf and stamped poses
-//! have no speed: it is computed from the forward distance since the pose before, so the first of them yields no
-//! reading.
+//! to another frame than the vehicle's, the tf tree transforms it; a missing chain is an error. tf, stamped poses and
+//! odometries without a finite twist have no speed: it is computed from the forward distance since the pose before, so
+//! the first of them, and the first after a step back of the stamps, yields no reading.
+//!
+//! A fault of a part of a message (a transform, a packet, points, an optional field) costs that part alone.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use bytes::Bytes;
 use clearway_mapping::event::{Body, EgoPose, Scan, UNKNOWN_SOURCE};
-use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message};
+use clearway_ros::pose::{Odometry, StampedTransform, TfMessage, Twist, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
-use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};
+use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points, RefusedPart};
 use nalgebra::{Isometry3, Vector3};
 
+use super::choice::RAISED_M;
 use crate::ingest::queue::Reading;
 
 /// The source of the ego poses.
@@ -51,12 +54,6 @@ pub enum RosMessageError {
         /// The vehicle's frame.
         ego_frame: String,
     },
-    /// The tf tree has as many frames as are allowed.
-    #[error("frame {frame}: up to 4096 frames are kept")]
-    Frames {
-        /// The frame that exceeds the limit.
-        frame: String,
-    },
 }
 
 impl RosMessageError {
@@ -66,7 +63,6 @@ impl RosMessageError {
             Self::Message(_) => "ros_message",
             Self::Kind { .. } => "ros_kind",
             Self::Frame { .. } => "ros_frame",
-            Self::Frames { .. } => "ros_frames",
         }
     }
 }
@@ -83,12 +79,21 @@ pub struct TopicDecoder {
     newest: Option<(i64, Isometry3<f64>)>,
     /// Number of transforms between the vehicle's frame and the nearest moving frame above it.
     steps_to_moving: usize,
+    /// Topics of clouds in the vehicle's frame.
+    lowered: BTreeSet<String>,
 }
 
 impl TopicDecoder {
     /// A decoder of these topics; `frames` are the transforms that are known before the first message.
     pub fn new(sensors: BTreeMap<String, u16>, pose: Option<PoseSource>, ego_frame: &str, frames: Frames) -> Self {
-        Self { sensors, pose, ego_frame: ego_frame.to_owned(), frames, newest: None, steps_to_moving: usize::MAX }
+        let (ego_frame, lowered) = (ego_frame.to_owned(), BTreeSet::new());
+        Self { sensors, pose, ego_frame, frames, newest: None, steps_to_moving: usize::MAX, lowered }
+    }
+
+    /// The decoder, with the points of these topics, which are in the vehicle's frame, moved to the frame of a sensor
+    /// over its origin.
+    pub(super) fn lowering(self, lowered: BTreeSet<String>) -> Self {
+        Self { lowered, ..self }
     }
 
     /// True if messages of this topic and type are decoded.
@@ -101,12 +106,17 @@ impl TopicDecoder {
         self.sensors.get(topic).copied().unwrap_or(UNKNOWN_SOURCE)
     }
 
+    /// The topic of a sensor.
+    pub fn topic(&self, source: u16) -> Option<&str> {
+        self.sensors.iter().find(|(_, index)| **index == source).map(|(topic, _)| topic.as_str())
+    }
+
     fn is_pose(&self, topic: &str) -> bool {
         matches!(&self.pose, Some(PoseSource::Topic(of)) if of == topic)
     }
 
     /// Decodes one message of an accepted topic and appends its readings to `readings`. Packets arrive at their own
-    /// stamps, everything else at `arrival_ns`.
+    /// stamps, everything else at `arrival_ns`. Returns the parts of the message that were refused.
     ///
     /// # Errors
     /// [`RosMessageError`] with the fault; then `readings` has no reading of the message.
@@ -117,22 +127,31 @@ impl TopicDecoder {
         arrival_ns: i64,
         bytes: &Bytes,
         readings: &mut VecDeque<Reading>,
-    ) -> Result<(), RosMessageError> {
+    ) -> Result<Vec<RefusedPart>, RosMessageError> {
+        let mut refused = Vec::new();
         if kind == Kind::TfMessage {
-            let pose = self.insert_transforms(&tf_message(bytes)?, topic.ends_with("tf_static"))?;
+            let pose = self.insert_transforms(tf_message(bytes)?, topic.ends_with("tf_static"), &mut refused);
             readings.extend(pose.map(|pose| Reading { arrival_ns, source: 0, body: Body::EgoPose(pose) }));
         } else if let Some(&source) = self.sensors.get(topic) {
             match kind {
                 Kind::PointCloud2 => {
-                    let scan = scan(Points::from_cloud(&PointCloud2::new(bytes)?)?);
-                    readings.push_back(Reading { arrival_ns, source, body: Body::Scan(scan) });
+                    let mut points = Points::from_cloud(&PointCloud2::new(bytes)?)?;
+                    refused = std::mem::take(&mut points.refused);
+                    if self.lowered.contains(topic) {
+                        points.z.iter_mut().for_each(|z| *z -= RAISED_M as f32);
+                    }
+                    readings.push_back(Reading { arrival_ns, source, body: Body::Scan(scan(points)) });
                 }
                 Kind::VelodyneScan => {
-                    let packets = VelodyneScan::new(bytes)?.packets().collect::<Result<Vec<_>, _>>()?;
-                    readings.extend(packets.into_iter().map(|(arrival_ns, packet)| {
-                        let body = Body::Datagram(bytes.slice_ref(packet));
-                        Reading { arrival_ns, source, body }
-                    }));
+                    for packet in VelodyneScan::new(bytes)?.packets() {
+                        match packet {
+                            Ok((arrival_ns, packet)) => {
+                                let body = Body::Datagram(bytes.slice_ref(packet));
+                                readings.push_back(Reading { arrival_ns, source, body });
+                            }
+                            Err(fault) => refused.push(RefusedPart { what: "packets", count: 1, fault }),
+                        }
+                    }
                 }
                 kind => {
                     return Err(RosMessageError::Kind { kind, allowed: "PointCloud2 and VelodyneScan for a sensor" });
@@ -140,7 +159,7 @@ impl TopicDecoder {
             }
         } else if self.is_pose(topic) {
             let pose = match kind {
-                Kind::Odometry => Some(self.pose_of_odometry(&Odometry::new(bytes)?)?),
+                Kind::Odometry => self.pose_of_odometry(&Odometry::new(bytes)?)?,
                 Kind::PoseStamped => {
                     let pose = pose_stamped(bytes)?;
                     self.pose_with_speed(pose.header.stamp_ns, pose.parent_from_child)
@@ -149,28 +168,35 @@ impl TopicDecoder {
             };
             readings.extend(pose.map(|pose| Reading { arrival_ns, source: 0, body: Body::EgoPose(pose) }));
         }
-        Ok(())
+        Ok(refused)
     }
 
-    fn pose_of_odometry(&self, odometry: &Odometry) -> Result<EgoPose, RosMessageError> {
+    /// An odometry without a child frame is that of the vehicle.
+    fn pose_of_odometry(&mut self, odometry: &Odometry) -> Result<Option<EgoPose>, RosMessageError> {
         let StampedTransform { header, child_frame_id, parent_from_child } = &odometry.transform;
+        let child_frame_id = if child_frame_id.is_empty() { &self.ego_frame } else { *child_frame_id };
         let child_from_ego = self.frames.a_from_b(child_frame_id, &self.ego_frame).ok_or_else(|| {
-            RosMessageError::Frame { frame: (*child_frame_id).to_owned(), ego_frame: self.ego_frame.clone() }
+            RosMessageError::Frame { frame: child_frame_id.to_owned(), ego_frame: self.ego_frame.clone() }
         })?;
-        // The twist is that of the child frame; while it rotates, a point at a distance from it moves as well.
-        let from_rotation = Vector3::from(odometry.angular_rps).cross(&child_from_ego.translation.vector);
-        let velocity = child_from_ego.rotation.inverse() * (Vector3::from(odometry.linear_mps) + from_rotation);
         let map_from_ego = parent_from_child * child_from_ego;
-        Ok(EgoPose { stamp_ns: header.stamp_ns, map_from_ego, speed_mps: velocity.x })
+        let Some(Twist { linear_mps, angular_rps }) = odometry.twist else {
+            return Ok(self.pose_with_speed(header.stamp_ns, map_from_ego));
+        };
+        // The twist is that of the child frame; while it rotates, a point at a distance from it moves as well.
+        let from_rotation = Vector3::from(angular_rps).cross(&child_from_ego.translation.vector);
+        let velocity = child_from_ego.rotation.inverse() * (Vector3::from(linear_mps) + from_rotation);
+        Ok(Some(EgoPose { stamp_ns: header.stamp_ns, map_from_ego, speed_mps: velocity.x }))
     }
 
     /// The ego pose with its speed, computed from the forward distance since the pose before. `None` for the first
-    /// pose, and for a pose that is not newer than the one before.
+    /// pose, for a repeated stamp, and if the stamps step back: the poses after the step are computed from this one, and
+    /// the pipeline decides whether an epoch has begun.
     fn pose_with_speed(&mut self, stamp_ns: i64, map_from_ego: Isometry3<f64>) -> Option<EgoPose> {
-        if self.newest.is_some_and(|(before_ns, _)| before_ns >= stamp_ns) {
+        if self.newest.is_some_and(|(before_ns, _)| before_ns == stamp_ns) {
             return None;
         }
-        let (before_ns, before) = self.newest.replace((stamp_ns, map_from_ego))?;
+        let before = self.newest.replace((stamp_ns, map_from_ego));
+        let (before_ns, before) = before.filter(|(before_ns, _)| *before_ns < stamp_ns)?;
         let seconds = stamp_ns.abs_diff(before_ns) as f64 * 1e-9;
         let forward_m = (before.inverse() * map_from_ego).translation.x;
         Some(EgoPose { stamp_ns, map_from_ego, speed_mps: forward_m / seconds })
@@ -181,13 +207,17 @@ impl TopicDecoder {
     /// some programs stamp them in advance.
     fn insert_transforms(
         &mut self,
-        transforms: &[StampedTransform],
+        message: TfMessage,
         are_static: bool,
-    ) -> Result<Option<EgoPose>, RosMessageError> {
+        refused: &mut Vec<RefusedPart>,
+    ) -> Option<EgoPose> {
+        let part = |fault| RefusedPart { what: "transforms", count: 1, fault };
+        refused.extend(message.refused.into_iter().map(|transform| part(transform.fault)));
         let mut stamp_ns = None;
-        for transform in transforms {
+        for transform in &message.transforms {
             if !self.frames.insert(transform) {
-                return Err(RosMessageError::Frames { frame: transform.child_frame_id.to_owned() });
+                refused.push(part(MessageError::value("frames", transform.child_frame_id, "up to 4096 frames")));
+                continue;
             }
             let steps = self.frames.steps_up(&self.ego_frame, transform.child_frame_id);
             if let Some(steps) = steps.filter(|steps| *steps <= self.steps_to_moving && !are_static) {
@@ -195,16 +225,14 @@ impl TopicDecoder {
                 stamp_ns = Some(transform.header.stamp_ns);
             }
         }
-        let (Some(stamp_ns), Some(PoseSource::Frames { fixed })) = (stamp_ns, &self.pose) else { return Ok(None) };
-        match self.frames.a_from_b(fixed, &self.ego_frame) {
-            Some(fixed_from_ego) => Ok(self.pose_with_speed(stamp_ns, fixed_from_ego)),
-            // The upper part of the chain may not have arrived yet.
-            None => Ok(None),
-        }
+        let (stamp_ns, Some(PoseSource::Frames { fixed })) = (stamp_ns?, &self.pose) else { return None };
+        // The upper part of the chain may not have arrived yet.
+        let fixed_from_ego = self.frames.a_from_b(fixed, &self.ego_frame)?;
+        self.pose_with_speed(stamp_ns, fixed_from_ego)
     }
 }
 
 fn scan(points: Points) -> Scan {
-    let Points { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns: _ } = points;
+    let Points { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns: _, refused: _ } = points;
     Scan { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns: Vec::new() }
 }

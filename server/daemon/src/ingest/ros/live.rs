@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use clearway_mapping::event::Cause;
-use clearway_ros::{Frames, Kind};
+use clearway_ros::{Frames, Kind, RefusedPart};
 use zenoh::Session;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::Sample;
@@ -120,9 +120,12 @@ impl SampleReceiver {
         };
         let bytes = sample.payload().to_bytes().into_owned().into();
         let mut readings = VecDeque::new();
-        if let Err(error) = self.decoder.decode(topic, kind, 0, &bytes, &mut readings) {
-            tracing::info!(vehicle = %self.vehicle, topic, %error, "ros: refused");
-            return self.record_refusal(topic, error.reason());
+        match self.decoder.decode(topic, kind, 0, &bytes, &mut readings) {
+            Ok(refused) => self.record_refused_parts(topic, &refused),
+            Err(error) => {
+                tracing::info!(vehicle = %self.vehicle, topic, %error, "ros: refused");
+                return self.record_refusal(topic, error.reason());
+            }
         }
         let now = Instant::now();
         for reading in readings {
@@ -132,6 +135,13 @@ impl SampleReceiver {
             if self.queue.push([LiveReading::new(Arrival::Now, reading.source, reading.body)]).is_err() {
                 return;
             }
+        }
+    }
+
+    fn record_refused_parts(&self, topic: &str, refused: &[RefusedPart]) {
+        for RefusedPart { what, count, fault } in refused {
+            tracing::info!(vehicle = %self.vehicle, topic, what, count, %fault, "ros: a part of a message refused");
+            self.queue.drops().record_refused_parts(*count);
         }
     }
 
