@@ -34,7 +34,7 @@ __all__ = [
 def watch(
     address: str,
     vehicle: str = "",
-    layers: Sequence[str] = (),
+    layers: str | Sequence[str] = (),
     max_in_flight: int = 2,
     max_rate_hz: float | None = None,
     region: Sequence[float] | None = None,
@@ -45,8 +45,8 @@ def watch(
 ) -> MapStream:
     """Streams the newest map, starting with the present one.
 
-    `vehicle` may be empty over gRPC if the server has a single vehicle. Without `layers`, every layer is sent; over
-    zenoh both must be named. With `tls` the connection is encrypted. The other arguments are for gRPC: at most
+    `vehicle` may be empty over gRPC if the server has a single vehicle. `layers` are names, or
+    one name; without them every layer is sent; over zenoh vehicle and layers must be named. With `tls` the connection is encrypted. The other arguments are for gRPC: at most
     `max_in_flight` maps are sent without an acknowledgement, and at most `max_rate_hz` maps per second. Each layer is
     cut to the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With `deltas`, layers are sent as
     changes from the map before: fewer bytes, the same maps. With `replay_clock`, a map is as old as it was when it was
@@ -56,6 +56,7 @@ def watch(
     counts the others.
     """
     _check_signed_by(address, signed_by)
+    layers = _names(layers)
     if endpoint := _zenoh(address, vehicle, layers):
         if max_rate_hz is not None or region is not None or deltas or replay_clock:
             text = "max_rate_hz, region, deltas and replay_clock are for gRPC, HOST:PORT"
@@ -73,12 +74,13 @@ def watch(
 def get(
     address: str,
     vehicle: str = "",
-    layers: Sequence[str] = (),
+    layers: str | Sequence[str] = (),
     tls: Tls | None = None,
     signed_by: str | PathLike[str] | None = None,
 ) -> Map:
     """Returns the newest map; it may be stale. `signed_by` as in `watch`."""
     _check_signed_by(address, signed_by)
+    layers = _names(layers)
     if endpoint := _zenoh(address, vehicle, layers):
         return over_zenoh.get(endpoint, vehicle, layers, tls, signed_by)
     return over_grpc.get(address, vehicle, layers, tls)
@@ -89,6 +91,11 @@ def vehicles(address: str, tls: Tls | None = None) -> list[str]:
     if address.startswith("zenoh:"):
         return over_zenoh.vehicles(address.removeprefix("zenoh:"), tls)
     return sorted(vehicle.name for vehicle in over_grpc.vehicles(address, tls))
+
+
+def _names(layers: str | Sequence[str]) -> Sequence[str]:
+    """Names of layers. One name is not the sequence of its letters."""
+    return [layers] if isinstance(layers, str) else layers
 
 
 def _check_signed_by(address: str, signed_by: str | PathLike[str] | None) -> None:

@@ -13,7 +13,7 @@ from .errors import ClearwayError, DecodeError
 from .freshness import Clock
 from .limits import MAP_BYTES_MAX
 from .map import Map
-from .stream import MapStream
+from .stream import LatestSlot, MapStream
 from .tls import Tls
 from .v1 import map_pb2, service_pb2, service_pb2_grpc
 
@@ -25,22 +25,26 @@ _OPTIONS = [
     ("grpc.http2.bdp_probe", 0),
     ("grpc.max_receive_message_length", MAP_BYTES_MAX + 65_536),
     ("grpc.use_local_subchannel_pool", 1),
+    # A vehicle is reached directly: a proxy of the environment is for the web.
+    ("grpc.enable_http_proxy", 0),
     # Longest time to connect.
     ("grpc.min_reconnect_backoff_ms", 5000),
 ]
 _TIMEOUT_S = 5.0
 
 
-def _service(address: str, tls: Tls | None) -> tuple[grpc.Channel, service_pb2_grpc.MapServiceStub]:
-    """The connection is made by the first call, which raises an error if no server answers or its certificate is
-    rejected."""
+def channel(address: str, tls: Tls | None = None) -> grpc.Channel:
+    """A channel to `HOST:PORT`, also written `http://HOST:PORT`, with certificates `https://HOST:PORT`. The connection
+    is made by the first call, which raises an error if no server answers or its certificate is rejected."""
+    target = address.removeprefix("http://" if tls is None else "https://").rstrip("/")
+    if "://" in target:
+        needed = "https:// needs tls" if target.startswith("https:") else "allowed: HOST:PORT, or zenoh:ENDPOINT"
+        raise ClearwayError("address", f"{address}: {needed}")
     if tls is None:
-        channel = grpc.insecure_channel(address, options=_OPTIONS)
-    else:
-        pem = tls.read()
-        credentials = grpc.ssl_channel_credentials(pem["ca"], pem.get("key"), pem.get("cert"))
-        channel = grpc.secure_channel(address, credentials, options=_OPTIONS)
-    return channel, service_pb2_grpc.MapServiceStub(channel)
+        return grpc.insecure_channel(target, options=_OPTIONS)
+    pem = tls.read()
+    credentials = grpc.ssl_channel_credentials(pem["ca"], pem.get("key"), pem.get("cert"))
+    return grpc.secure_channel(target, credentials, options=_OPTIONS)
 
 
 def refused(address: str, error: grpc.RpcError) -> ClearwayError:
@@ -53,8 +57,8 @@ def _led_to(error: grpc.RpcError) -> str | None:
 
 
 def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
-    channel, service = _service(address, tls)
-    with channel:
+    with channel(address, tls) as opened:
+        service = service_pb2_grpc.MapServiceStub(opened)
         try:
             return list(service.ListVehicles(service_pb2.ListVehiclesRequest(), timeout=_TIMEOUT_S).vehicles)
         except grpc.RpcError as error:
@@ -76,8 +80,8 @@ def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> M
 
 
 def _get(address: str, request: service_pb2.GetMapRequest, tls: Tls | None) -> Map:
-    channel, service = _service(address, tls)
-    with channel:
+    with channel(address, tls) as opened:
+        service = service_pb2_grpc.MapServiceStub(opened)
         return Map(service.GetMap(request, timeout=_TIMEOUT_S).map).with_arrival()
 
 
@@ -85,10 +89,10 @@ class _Watch:
     """One open stream of maps, on a connection of its own."""
 
     def __init__(self, address: str, selection: service_pb2.Selection, tls: Tls | None) -> None:
-        self.channel, service = _service(address, tls)
+        self.channel = channel(address, tls)
         self.requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
         self.requests.put(service_pb2.WatchRequest(selection=selection))
-        self.updates = service.Watch(iter(self.requests.get, None))
+        self.updates = service_pb2_grpc.MapServiceStub(self.channel).Watch(iter(self.requests.get, None))
 
     def close(self) -> None:
         self.requests.put(None)
@@ -99,34 +103,33 @@ class _Watch:
 def watch(
     address: str, selection: service_pb2.Selection, tls: Tls | None, *, replay_clock: bool = False
 ) -> MapStream:
-    stream = MapStream(Clock(is_of_replay=replay_clock), has_one_server=True)
+    slot = LatestSlot(Clock(is_of_replay=replay_clock), has_one_server=True)
     opened = [_Watch(address, selection, tls)]
 
     def run(at: str, *, may_be_led: bool) -> None:
         of = opened[-1]
         try:
-            _receive_maps(stream, of.updates, of.requests.put, acknowledges=selection.max_in_flight > 0)
-            stream.end(ClearwayError("ended", f"{at}: the server has ended the stream"))
+            _receive_maps(slot, of.updates, of.requests.put, acknowledges=selection.max_in_flight > 0)
+            slot.end(ClearwayError("ended", f"{at}: the server has ended the stream"))
         except grpc.RpcError as error:
             server = _led_to(error) if may_be_led else None
             if server is None:
-                stream.end(refused(at, error))
+                slot.end(refused(at, error))
                 return
             of.close()
             opened.append(_Watch(server, selection, tls))
             run(server, may_be_led=False)
         except ClearwayError as error:
-            stream.end(error)
+            slot.end(error)
         except Exception as error:  # noqa: BLE001: any error ends the stream.
-            stream.end(ClearwayError("protobuf", f"{at}: {error}"))
+            slot.end(ClearwayError("protobuf", f"{at}: {error}"))
 
-    stream.on_close(lambda: [of.close() for of in list(opened)])
     threading.Thread(target=run, args=(address,), kwargs={"may_be_led": True}, name="clearway watch", daemon=True).start()
-    return stream
+    return MapStream(slot, lambda: [of.close() for of in list(opened)])
 
 
 def _receive_maps(
-    stream: MapStream,
+    slot: LatestSlot,
     updates: Iterable[service_pb2.MapUpdate],
     request: Callable[[service_pb2.WatchRequest], None],
     *,
@@ -139,7 +142,7 @@ def _receive_maps(
     is_requested, left_out = False, 0
     for update in updates:
         if update.replay_ended:
-            stream.end_replay()
+            slot.end_replay()
             continue
         left_out += update.left_out
         message = map_pb2.Map.FromString(update.map)
@@ -151,7 +154,7 @@ def _receive_maps(
             # Maps of another run, or before a jump of a replay, were not skipped.
             is_next = base is not None and base.header.boot_id == m.header.boot_id
             between = m.sequence - base.sequence - 1 if is_next else 0
-            stream.store(m, max(between - left_out, 0), left_out=left_out)
+            slot.store(m, max(between - left_out, 0), left_out=left_out)
             base, is_requested, left_out = m, False, 0
         except DecodeError:
             if not any(layer.HasField("base_sequence") for layer in message.layers):
@@ -159,6 +162,6 @@ def _receive_maps(
             # More deltas may be in flight; one request is enough for all of them.
             answer.request_keyframe, is_requested = not is_requested, True
         if update.lockstep and acknowledges and not answer.request_keyframe:
-            stream.wait_until_handled()
+            slot.wait_until_handled()
         if answer.request_keyframe or acknowledges:
             request(answer)

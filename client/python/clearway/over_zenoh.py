@@ -10,7 +10,6 @@ what does not belong on the key is counted and passed over.
 
 from __future__ import annotations
 
-import atexit
 import json
 import threading
 import time
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING
 from .errors import ClearwayError
 from .map import Map
 from .signature import PublicKey
-from .stream import MapStream
+from .stream import LatestSlot, MapStream
 from .tls import Tls
 from .v1 import map_pb2
 
@@ -165,29 +164,26 @@ def watch(
 ) -> MapStream:
     server = None if signed_by is None else PublicKey(signed_by)
     session = _session(endpoint, tls)
-    stream = MapStream()
+    slot = LatestSlot()
     threads: list[threading.Thread] = []
 
     def close() -> None:
-        atexit.unregister(close)
         session.close()
         # The garbage collector may call this from one of them.
         for thread in threads:
             if thread is not threading.current_thread():
                 thread.join(_TIMEOUT_S)
 
-    # A thread that returns from zenoh while Python shuts down would abort the process.
-    atexit.register(close)
-    stream.on_close(close)
     try:
-        writer = _StreamWriter(stream, layers)
+        writer = _StreamWriter(slot, layers)
         for layer in writer.layers:
             threads += _LayerSubscription(session, _LayerKey(vehicle, layer, server), writer).threads
-        threads.append(_ReplaySubscription(session, f"clearway/{vehicle}/replay", stream).thread)
+        threads.append(_ReplaySubscription(session, f"clearway/{vehicle}/replay", slot).thread)
     except Exception as error:
         close()
         raise ClearwayError("zenoh", f"subscribe to the layers of {vehicle!r}: {error}") from None
-    return stream
+    # The stream closes before Python shuts down: a thread that returned from zenoh later would abort the process.
+    return MapStream(slot, close)
 
 
 class _LayerSubscription:
@@ -246,10 +242,10 @@ class _LayerSubscription:
 class _ReplaySubscription:
     """The key of a vehicle's replay -> its end, after its last map."""
 
-    def __init__(self, session: zenoh.Session, key: str, stream: MapStream) -> None:
+    def __init__(self, session: zenoh.Session, key: str, slot: LatestSlot) -> None:
         import zenoh
 
-        self._session, self._key, self._stream, self._told = session, key, stream, False
+        self._session, self._key, self._slot, self._told = session, key, slot, False
         self._ends = session.declare_subscriber(key, zenoh.handlers.RingChannel(_SAMPLES_KEPT))
         self.thread = threading.Thread(target=self._read, name="clearway watch replay", daemon=True)
         self.thread.start()
@@ -277,16 +273,16 @@ class _ReplaySubscription:
             return
         was_told, self._told = self._told, ended
         if error is not None:
-            self._stream.end(ClearwayError("UNAVAILABLE", str(error)))
+            self._slot.end(ClearwayError("UNAVAILABLE", str(error)))
         elif ended and not was_told:
             # Other threads store the maps. One that the link lost does not come.
             until = time.monotonic() + _LAST_MAP_S
             while not self._has(*last) and time.monotonic() < until:
                 time.sleep(0.005)
-            self._stream.end_replay()
+            self._slot.end_replay()
 
     def _has(self, boot_id: int | None, sequence: int) -> bool:
-        newest = self._stream.newest()
+        newest = self._slot.newest()
         if boot_id is None or newest is None:
             return boot_id is None
         return newest.header.boot_id == boot_id and newest.sequence >= sequence
@@ -295,8 +291,8 @@ class _ReplaySubscription:
 class _StreamWriter:
     """Parts of maps from one thread per layer -> a stream."""
 
-    def __init__(self, stream: MapStream, layers: Sequence[str]) -> None:
-        self._stream, self._collector, self._lock = stream, _LayerCollector(layers), threading.Lock()
+    def __init__(self, slot: LatestSlot, layers: Sequence[str]) -> None:
+        self._slot, self._collector, self._lock = slot, _LayerCollector(layers), threading.Lock()
         self.layers = list(dict.fromkeys(layers))
         #: Samples missed of each layer since the last complete map.
         self._missed = dict.fromkeys(self.layers, 0)
@@ -311,12 +307,12 @@ class _StreamWriter:
         try:
             part = layer.part(sample)
         except _Unfit as unfit:
-            self._stream.pass_over(str(unfit))
+            self._slot.pass_over(str(unfit))
             return False
         with self._lock:
             for whole in self._collector.add(*part):
                 # A missed map that was queried has arrived, so it is not a skipped one.
-                if self._stream.store(Map(whole), None, lost=max(self._missed.values())):
+                if self._slot.store(Map(whole), None, lost=max(self._missed.values())):
                     self._missed = dict.fromkeys(self.layers, 0)
         return True
 

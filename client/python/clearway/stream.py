@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -52,7 +53,64 @@ _AFTER_END_S = 2.0
 
 class MapStream:
     """An iterator over the newest map; it stops at the end of a replay, and has no end otherwise. Close it, or use it
-    in a `with` statement."""
+    in a `with` statement; a stream that is dropped, or open at the end of the process, is closed."""
+
+    def __init__(self, slot: LatestSlot, close: Callable[[], None]) -> None:
+        self._slot = slot
+
+        def end() -> None:
+            slot.close()
+            close()
+
+        #: Called once: when the stream is closed or dropped, or the process ends.
+        self._close = weakref.finalize(self, end)
+
+    def __iter__(self) -> Iterator[Map]:
+        return self
+
+    def __next__(self) -> Map:
+        """Waits for a map newer than the last one returned, which counts as handled: a replay in lockstep goes on then.
+        Raises the reason if the stream has ended; stops when closed, and after the last map of a replay. Iterate again
+        for the maps of a replay that is set back: it waits 2 s for them, and then stops again."""
+        try:
+            return self._slot.next(report_stale=False)
+        except ReplayEnded:
+            raise StopIteration from None
+
+    def next_or_stale(self) -> Map:
+        """Waits for a map newer than the last one returned, or until that one is stale. A stale map is returned again,
+        once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. Raises the reason if the
+        stream has ended: `ReplayEnded` at the end of a replay, as an iteration stops there, `ClearwayError` of reason
+        "closed" when closed."""
+        try:
+            return self._slot.next(report_stale=True)
+        except StopIteration:
+            raise ClearwayError("closed", "the stream is closed") from None
+
+    def newest(self) -> Map | None:
+        """The newest map at this moment; `None` before the first. It does not wait and does not change the counts of
+        the next map. The map may be stale."""
+        return self._slot.newest()
+
+    def close(self) -> None:
+        """Ends the stream. A reader that waits for a map stops waiting."""
+        self._close()
+
+    def __enter__(self) -> MapStream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def passed_over(self) -> PassedOver:
+        """Numbers of received maps that were passed over since the start of the stream, by reason."""
+        return self._slot.passed_over()
+
+
+class LatestSlot:
+    """The slot between a background thread, which stores maps, and a `MapStream`, which reads the newest. A thread has
+    no reference to the stream, so that a stream that nobody has any more ends."""
 
     def __init__(self, clock: Clock = Clock(), *, has_one_server: bool = False) -> None:
         self._clock = clock
@@ -74,31 +132,25 @@ class MapStream:
         self._replay_ends = self._replay_ends_seen = 0
         #: True if no map has come since a replay has ended.
         self._at_end = False
-        self._close: Callable[[], None] = lambda: None
 
-    def __iter__(self) -> Iterator[Map]:
-        return self
+    def newest(self) -> Map | None:
+        """The newest map at this moment."""
+        with self._changed:
+            return self._newest
 
-    def __next__(self) -> Map:
-        """Waits for a map newer than the last one returned, which counts as handled: a replay in lockstep goes on then.
-        Raises the reason if the stream has ended; stops when closed, and after the last map of a replay. Iterate again
-        for the maps of a replay that is set back: it waits 2 s for them, and then stops again."""
-        try:
-            return self._next(report_stale=False)
-        except ReplayEnded:
-            raise StopIteration from None
+    def passed_over(self) -> PassedOver:
+        """Numbers of received maps that were passed over."""
+        with self._changed:
+            return self._passed_over
 
-    def next_or_stale(self) -> Map:
-        """Waits for a map newer than the last one returned, or until that one is stale. A stale map is returned again,
-        once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. Raises the reason if the
-        stream has ended: `ReplayEnded` at the end of a replay, as an iteration stops there, `ClearwayError` of reason
-        "closed" when closed."""
-        try:
-            return self._next(report_stale=True)
-        except StopIteration:
-            raise ClearwayError("closed", "the stream is closed") from None
+    def close(self) -> None:
+        """Ends every wait for a map."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
 
-    def _next(self, *, report_stale: bool) -> Map:
+    def next(self, *, report_stale: bool) -> Map:
+        """Waits as `MapStream.next_or_stale` does, or as `MapStream.__next__`. For the reader."""
         with self._changed:
             self._handled = self._seen
             self._changed.notify_all()
@@ -135,33 +187,8 @@ class MapStream:
         """True from the end of a replay until the iteration has stopped for it."""
         return self._replay_ends > self._replay_ends_seen
 
-    def newest(self) -> Map | None:
-        """The newest map at this moment; `None` before the first. It does not wait and does not change the counts of
-        the next map. The map may be stale."""
-        with self._changed:
-            return self._newest
-
-    def close(self) -> None:
-        """Ends the stream. A reader that waits for a map stops waiting."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._close()
-
-    def __enter__(self) -> MapStream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __del__(self) -> None:
-        self._close()
-
-    @property
-    def passed_over(self) -> PassedOver:
-        """Numbers of received maps that were passed over since the start of the stream, by reason."""
-        with self._changed:
-            return self._passed_over
+    def _is_unseen(self) -> bool:
+        return self._newest is not None and self._seen != self._counters
 
     def store(self, m: Map, skipped: int | None, *, lost: int = 0, left_out: int = 0) -> bool:
         """Stores a map as the newest, or counts it as passed over. Between it and the one before there are `skipped`
@@ -210,13 +237,6 @@ class MapStream:
             self._replay_ends += 1
             self._at_end = True
             self._changed.notify_all()
-
-    def on_close(self, close: Callable[[], None]) -> None:
-        """Sets a function that is called when the stream is closed."""
-        self._close = close
-
-    def _is_unseen(self) -> bool:
-        return self._newest is not None and self._seen != self._counters
 
 
 def _refuse(newest: Map, m: Map) -> str | None:

@@ -27,7 +27,7 @@ import grpc
 
 import clearway
 
-from .over_grpc import refused
+from .over_grpc import channel, refused
 from .v1 import replay_pb2, replay_pb2_grpc
 
 #: The golden recording: 0.9 s of a car with a VLP-16 in a simulated town, 10 maps.
@@ -152,9 +152,9 @@ class Replay:
         return self._call(replay_pb2.ReplayControl()).begin_ns
 
     def _call(self, request: replay_pb2.ReplayControl) -> replay_pb2.ReplayState:
-        with grpc.insecure_channel(self.grpc) as channel:
+        with channel(self.grpc) as opened:
             try:
-                return replay_pb2_grpc.ReplayServiceStub(channel).Control(request, timeout=PATIENCE_S)
+                return replay_pb2_grpc.ReplayServiceStub(opened).Control(request, timeout=PATIENCE_S)
             except grpc.RpcError as error:
                 raise refused(self.grpc, error) from None
 

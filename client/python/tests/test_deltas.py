@@ -4,7 +4,7 @@ import pytest
 
 import clearway
 from clearway.over_grpc import _receive_maps
-from clearway.stream import MapStream
+from clearway.stream import LatestSlot
 from clearway.v1 import map_pb2, service_pb2
 
 
@@ -17,15 +17,15 @@ def update(sequence, base_sequence=None):
 
 
 def receive(*updates):
-    stream, requests, returned = MapStream(), [], []
+    slot, requests, returned = LatestSlot(), [], []
 
     def incoming():
         for update in updates:
             yield update
-            if stream._is_unseen():
-                returned.append(next(stream))
+            if slot._is_unseen():
+                returned.append(slot.next(report_stale=False))
 
-    _receive_maps(stream, incoming(), requests.append, acknowledges=True)
+    _receive_maps(slot, incoming(), requests.append, acknowledges=True)
     return [(m.sequence, m.skipped) for m in returned], [(r.acknowledged, r.request_keyframe) for r in requests]
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import clearway
 from clearway.freshness import POLL_INTERVAL_S, Clock
-from clearway.stream import MapStream
+from clearway.stream import LatestSlot, MapStream
 from clearway.v1 import map_pb2
 
 MS = 1_000_000
@@ -25,7 +25,8 @@ class TestBed:
     def __init__(self, *, has_one_server=False):
         self.wall_ns, self.steady_ns = START_NS, 0
         clock = Clock(lambda: self.wall_ns, lambda: self.steady_ns)
-        self.stream = MapStream(clock, has_one_server=has_one_server)
+        self.slot = LatestSlot(clock, has_one_server=has_one_server)
+        self.stream = MapStream(self.slot, lambda: None)
 
     def pass_(self, ns):
         self.wall_ns += ns
@@ -37,7 +38,7 @@ class TestBed:
     def store(self, boot_id, sequence, end_ns):
         header = map_pb2.Header(vehicle="alpha", boot_id=boot_id, sequence=sequence, capture_start_ns=end_ns,
                                 capture_end_ns=end_ns, valid_until_ns=end_ns + VALID_MS * MS)  # fmt: skip
-        self.stream.store(clearway.Map(map_pb2.Map(header=header).SerializeToString()), 0)
+        self.slot.store(clearway.Map(map_pb2.Map(header=header).SerializeToString()), 0)
 
     def next(self):
         m = self.stream.next_or_stale()
@@ -45,7 +46,7 @@ class TestBed:
 
     def is_silent(self):
         """True if there is no newer map and the newest was reported as stale."""
-        return not self.stream._is_unseen() and self.stream._fresh is None
+        return not self.slot._is_unseen() and self.slot._fresh is None
 
     def check_becomes_stale(self, sequence):
         self.pass_(260 * MS)
@@ -78,7 +79,7 @@ def test_the_last_map_of_a_stopped_server_becomes_stale():
     bed = TestBed()
     bed.store_aged(7, 0, 40 * MS)
     assert bed.next() == (False, 0, 40 * MS)
-    bed.stream.end(clearway.ClearwayError("UNAVAILABLE", "alpha:1"))
+    bed.slot.end(clearway.ClearwayError("UNAVAILABLE", "alpha:1"))
     with pytest.raises(clearway.ClearwayError, match="alpha:1"):
         bed.stream.next_or_stale()
     bed.pass_(261 * MS)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -102,6 +103,43 @@ def test_a_closed_stream_ends_its_loop():
     assert len(seen) == 2
 
 
+@pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
+def test_streams_that_are_dropped_end(transport):
+    def drop():
+        for _ in clearway.watch(**transport, layers=["drivability"]):
+            break
+
+    drop()
+    threads = set(threading.enumerate())
+    for _ in range(5):
+        drop()
+    for thread in set(threading.enumerate()) - threads:
+        thread.join(60)
+        assert not thread.is_alive(), thread
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
+def test_the_name_of_a_layer_is_one_layer(transport):
+    assert list(clearway.get(**transport, layers="drivability").layers) == ["drivability"]
+
+
+def test_a_proxy_of_the_environment_is_not_used_for_a_vehicle(monkeypatch):
+    for name in ["http_proxy", "https_proxy", "grpc_proxy"]:
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    assert clearway.vehicles(GRPC) == clearway.vehicles(f"http://{GRPC}") == ["car"]
+
+
+@pytest.mark.parametrize("address", [f"https://{GRPC}", f"tcp://{GRPC}"])
+def test_an_address_of_another_kind_is_refused_with_what_is_needed(address):
+    with pytest.raises(clearway.ClearwayError, match="tls|HOST:PORT"):
+        clearway.vehicles(address)
+
+
+def test_a_test_without_the_fixture_imports_nothing_of_the_client():
+    program = "import sys, clearway_pytest; sys.exit('clearway' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
+
+
 def test_a_program_may_end_without_closing_its_stream():
     program = f"import clearway; maps = clearway.watch({GRPC!r}); next(maps)"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
@@ -129,3 +167,10 @@ def test_a_recording_has_its_maps_in_order():
     assert clearway.read(RECORDING, "drivability").__next__()["drivability"].free.any()
     with pytest.raises(clearway.ClearwayError, match="/car/map/drivability"):
         next(clearway.read(RECORDING, "dirt"))
+
+
+def test_a_recording_that_was_cut_is_refused_with_what_helps(tmp_path):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(Path(RECORDING).read_bytes()[:-1000])
+    with pytest.raises(clearway.ClearwayError, match="clearway repair"):
+        next(clearway.read(cut, "drivability"))
