@@ -204,7 +204,8 @@ fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config,
         ("listen/endpoints", json(options.listen.clone().into())),
         ("connect/endpoints", json(options.connect.clone().into())),
         ("scouting/multicast/enabled", json(options.scouting.into())),
-        ("scouting/gossip/enabled", json(options.scouting.into())),
+        // Peers behind one router, such as ROS 2 nodes behind rmw_zenohd, reach one another without it.
+        ("scouting/gossip/enabled", json((options.scouting || !options.connect.is_empty()).into())),
         ("timestamping/enabled", json(true.into())),
         ("transport/link/rx/max_message_size", json(message_bytes_max.into())),
     ];

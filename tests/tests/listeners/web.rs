@@ -25,6 +25,8 @@ async fn only_get_and_head_from_the_page_itself_are_answered() {
             ("[::1]:8080", 200),
             ("localhost", 200),
             ("car.example:8080", 200),
+            ("Car.Example:8080", 200),
+            ("LOCALHOST:8080", 200),
         ] {
             let answer = ask(address, &get("/healthz").replace("localhost", host)).await;
             let is_missing = Some(address) == running.foxglove && status == 200;

@@ -9,7 +9,7 @@ use clearway_daemon::run::{Running, Server, Setup};
 use zenoh::sample::SampleKind;
 
 use crate::fixture::routers::router;
-use crate::fixture::{config, feed, readings, sequence, start, within};
+use crate::fixture::{Driving, config, feed, readings, sequence, start, within};
 
 const LAYER: &str = "drivability";
 
@@ -181,6 +181,44 @@ async fn a_layer_without_subscribers_is_made_at_once_for_a_new_planner() {
     assert_eq!((update.map.sequence(), update.skipped), (maps, 0));
     assert_eq!(update.map.header().capture_end_ns, made().capture_end_ns);
     within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_ros_2_node_behind_the_router_of_rmw_zenoh_hears_a_server_in_its_default_mode() {
+    // As rmw_zenoh ships them: the router passes nothing from one peer to another, and nodes are peers.
+    let settings = |mode: &str, listen: &str, connect: &[&str]| {
+        let mut config = zenoh::Config::default();
+        let gossip = r#"{ enabled: true, target: { router: ["router", "peer"], peer: ["router"] },
+                          autoconnect: { router: [], peer: ["router", "peer"] } }"#;
+        for (key, value) in [
+            ("mode", format!("{mode:?}")),
+            ("listen/endpoints", format!("[{listen:?}]")),
+            ("connect/endpoints", format!("{connect:?}")),
+            ("scouting/multicast/enabled", "false".into()),
+            ("scouting/gossip", gossip.into()),
+            ("routing/router/peers_failover_brokering", "false".into()),
+        ] {
+            config.insert_json5(key, &value).unwrap();
+        }
+        config
+    };
+    let any = "tcp/127.0.0.1:0";
+    let router = within("a router", zenoh::open(settings("router", any, &[])).into_future()).await.unwrap();
+    let at = router.info().locators().await.first().expect("it listens").to_string();
+    let mut config = config();
+    config.zenoh.enabled = true;
+    (config.zenoh.listen, config.zenoh.connect) = (vec![any.into()], vec![at.clone()]);
+    config.zenoh.ros2.enabled = true;
+    let running = start(config).await;
+    let node = within("a node", zenoh::open(settings("peer", any, &[&at])).into_future()).await.unwrap();
+    let grids = node.declare_subscriber("0/clearway/car/drivability/nav_msgs::msg::dds_::OccupancyGrid_/**").await;
+    let grids = grids.unwrap();
+    let car = Driving::to(&running);
+    within("a grid", grids.recv_async().into_future()).await.unwrap();
+    car.halt();
+    within("shutdown", running.shutdown()).await.unwrap();
+    node.close().await.unwrap();
+    router.close().await.unwrap();
 }
 
 fn client_of(endpoint: &str) -> zenoh::Config {

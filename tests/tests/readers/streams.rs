@@ -38,6 +38,21 @@ async fn watch(running: &clearway_daemon::run::Running, max_in_flight: u32) -> (
     (Requests(sender), updates)
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_reader_that_has_ended_its_requests_has_the_maps_of_its_credits_and_is_told_why_no_more_come() {
+    let running = start(config()).await;
+    let car = fixture::Driving::to(&running);
+    let (requests, mut updates) = watch(&running, 2).await;
+    drop(requests);
+    for _ in 0..2 {
+        within("a map", updates.message()).await.unwrap().expect("a map for each credit");
+    }
+    let told = within("an end", updates.message()).await.unwrap_err();
+    assert!(told.code() == Code::FailedPrecondition && told.message().contains("max_in_flight = 0"), "{told}");
+    car.halt();
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
 /// A zenoh session connected to the server only.
 async fn session(running: &clearway_daemon::run::Running) -> Session {
     let mut config = zenoh::Config::default();

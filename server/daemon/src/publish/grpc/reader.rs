@@ -119,6 +119,11 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     /// disconnected.
     async fn next(&mut self) -> Result<Option<v1::MapUpdate>, Status> {
         loop {
+            if self.requests.is_none() && !self.selection.credits.left() {
+                let text = "the requests have ended, so no acknowledgement can come any more: keep them open, or set \
+                            max_in_flight = 0";
+                return Err(Status::failed_precondition(text));
+            }
             // Only now: the last map comes before the end.
             if self.is_end_due && !self.newest.has_changed().unwrap_or(false) {
                 self.is_end_due = false;

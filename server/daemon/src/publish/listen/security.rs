@@ -55,13 +55,13 @@ impl Current {
         names.into_iter().next()
     }
 
-    /// True if a browser may address the server by this host.
+    /// True if a browser may address the server by this host. Names have no case (RFC 9110, section 4.2.3).
     pub fn is_own_host(&self, host: &str) -> bool {
         let certified = self.tls.iter().flat_map(|tls| &tls.names);
         // Another page cannot make a browser send an address that is not the server's own.
         host.parse::<IpAddr>().is_ok()
-            || host == "localhost"
-            || self.hosts.iter().chain(certified).any(|own| own == host)
+            || host.eq_ignore_ascii_case("localhost")
+            || self.hosts.iter().chain(certified).any(|own| own.eq_ignore_ascii_case(host))
     }
 }
 

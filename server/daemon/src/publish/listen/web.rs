@@ -3,7 +3,7 @@
 
 use axum::body::Body;
 use axum::http::header::{self, HeaderMap, HeaderValue};
-use axum::http::uri::Authority;
+use axum::http::uri::{Authority, Uri};
 use axum::http::{Method, Request, Response, StatusCode};
 use axum::response::IntoResponse;
 use tonic::{Code, Status};
@@ -50,7 +50,7 @@ pub fn check(
     if let Some(origin) = text_of(headers, header::ORIGIN) {
         // Without certificates of its own, the server may stand behind a proxy that has some.
         let is_scheme = |scheme: &str| scheme == "https" || (scheme == "http" && current.tls.is_none());
-        let own = origin.split_once("://").filter(|(scheme, authority)| is_scheme(scheme) && *authority == host);
+        let own = origin.split_once("://").filter(|(scheme, authority)| is_scheme(scheme) && authority.eq_ignore_ascii_case(host));
         let is_own = own.is_some();
         if !is_own && !origins.contains(&origin) && !current.origins.iter().any(|listed| listed == origin) {
             let text = format!("origin {origin:?}: the page itself, or an origin in connections.origins, is allowed");
@@ -67,7 +67,7 @@ pub fn check(
         && text_of(headers, header::ACCEPT).is_some_and(|kinds| kinds.contains("text/html"));
     match in_query.filter(|_| is_page) {
         None => Ok((caller, names)),
-        Some(token) => Err(Box::new(redirect_with_cookie(request.uri().path(), token))),
+        Some(token) => Err(Box::new(redirect_with_cookie(request.uri(), token))),
     }
 }
 
@@ -85,13 +85,18 @@ fn refuse_role(status: &Status, is_nameless: bool) -> Box<Response<Body>> {
     Box::new(response)
 }
 
-/// A cookie that scripts cannot read and that other pages cannot send, and the address without the token. Browsers take
-/// a path that begins with two slashes for another host.
-fn redirect_with_cookie(path: &str, token: &str) -> Response<Body> {
+/// A cookie that scripts cannot read and that other pages cannot send, and the address without the token. It is
+/// relative to the address that the browser has, which may have more folders than the server's behind a proxy.
+fn redirect_with_cookie(uri: &Uri, token: &str) -> Response<Body> {
     let cookie = format!("{COOKIE}={token}; Path=/; HttpOnly; Secure; SameSite=Strict");
-    let path = format!("/{}", path.trim_start_matches(['/', '\\']));
-    let headers = [(header::SET_COOKIE, cookie), (header::LOCATION, path)];
-    (StatusCode::SEE_OTHER, headers).into_response()
+    let pairs = uri.query().unwrap_or_default().split('&');
+    let kept: Vec<_> = pairs.filter(|pair| pair.split_once('=').is_none_or(|(key, _)| key != QUERY)).collect();
+    let page = uri.path().rsplit('/').next().unwrap_or_default();
+    let address = match kept.join("&") {
+        query if query.is_empty() => format!("./{page}"),
+        query => format!("./{page}?{query}"),
+    };
+    (StatusCode::SEE_OTHER, [(header::SET_COOKIE, cookie), (header::LOCATION, address)]).into_response()
 }
 
 fn query_token<B>(request: &Request<B>) -> Option<&str> {
