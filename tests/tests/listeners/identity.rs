@@ -49,7 +49,9 @@ async fn every_path_asks_for_a_certificate_or_a_token_with_a_role() {
     let (status, answer) = ask(page, &browser, None).await;
     assert!(status == 303 && answer.contains("location: ./\r\n"), "{answer}");
     // The address is relative, so that it has the folders of a proxy, and no path becomes another host.
-    for (path, location) in [("/?vehicle=bus&", "./?vehicle=bus"), ("/a/b.html?", "./b.html"), ("//evil.example/?", "./")] {
+    for (path, location) in
+        [("/?vehicle=bus&", "./?vehicle=bus"), ("/a/b.html?", "./b.html"), ("//evil.example/?", "./")]
+    {
         let asked = browser.replace("GET /?", &format!("GET {path}"));
         let answer = ask(page, &asked, None).await.1;
         assert!(answer.contains(&format!("location: {location}\r\n")), "{path}: {answer}");

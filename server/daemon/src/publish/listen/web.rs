@@ -50,7 +50,9 @@ pub fn check(
     if let Some(origin) = text_of(headers, header::ORIGIN) {
         // Without certificates of its own, the server may stand behind a proxy that has some.
         let is_scheme = |scheme: &str| scheme == "https" || (scheme == "http" && current.tls.is_none());
-        let own = origin.split_once("://").filter(|(scheme, authority)| is_scheme(scheme) && authority.eq_ignore_ascii_case(host));
+        let own = origin
+            .split_once("://")
+            .filter(|(scheme, authority)| is_scheme(scheme) && authority.eq_ignore_ascii_case(host));
         let is_own = own.is_some();
         if !is_own && !origins.contains(&origin) && !current.origins.iter().any(|listed| listed == origin) {
             let text = format!("origin {origin:?}: the page itself, or an origin in connections.origins, is allowed");
