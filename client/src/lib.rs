@@ -22,7 +22,7 @@
 //! |---|---|
 //! | `freshness` | two clocks -> least age of a map |
 //! | [`view`] | encoded map -> [`MapView`]: decoded once, cheap to clone, with its age |
-//! | [`footprint`] | map and area, path or point -> whether it is free, what blocks it, what is nearest, the clearance |
+//! | [`footprint`] | map and area, path or point -> what is free, what blocks it, what is nearest, the clearance |
 //! | [`stream`] | updates -> the newest map, with the number of skipped ones |
 //! | [`grpc`] | address of a server -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |

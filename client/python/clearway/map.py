@@ -171,8 +171,8 @@ class Layer:
 
     def clearance(self, most_m: float = 10.0, passes_low: bool = False) -> np.ndarray:
         """For each cell the distance in metres from its centre to the nearest point of a cell that is not free, at most
-        `most_m`, in the shape of the grid; 0 in such a cell. What lies outside the grid is not free, nor are low things,
-        unless `passes_low` is true: for a vehicle that clears them."""
+        `most_m`, in the shape of the grid; 0 in such a cell. What lies outside the grid is not free, nor are low
+        things, unless `passes_low` is true: for a vehicle that clears them."""
         return self._asked.clearance(most_m, passes_low)
 
     @property

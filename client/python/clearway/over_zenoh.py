@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     import zenoh.ext
 
 _TIMEOUT_S = 5.0
-#: Time until the next attempt to open a session; longest time for an endpoint to answer, in ms, in the first attempt and
-#: in the attempts after it.
+#: Time until the next attempt to open a session; longest time for an endpoint to answer, in ms, in the first attempt
+#: and in the attempts after it.
 _OPEN_RETRY_S, _OPEN_TIMEOUT_MS = 0.2, (500, 2000)
 #: Most gaps kept between two samples. If there are more (the process was suspended), the first count as skipped and not
 #: as lost.

@@ -110,7 +110,7 @@ class MapStream:
 
 class LatestSlot:
     """The slot between a background thread, which stores maps, and a `MapStream`, which reads the newest. A thread has
-    no reference to the stream, so that a stream that nobody has any more ends."""
+    no reference to the stream, so that a stream ends when its reader drops it."""
 
     def __init__(self, clock: Clock = Clock(), *, has_one_server: bool = False) -> None:
         self._clock = clock

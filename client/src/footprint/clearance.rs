@@ -1,12 +1,12 @@
 //! The clearance of every cell: how far it is to the nearest cell that is not free.
 //!
-//! In: a layer of squares. Out: for each cell the distance in metres from its centre to the nearest point of a cell that
-//! is not free, exact up to a bound; 0 in such a cell. What lies outside the grid is not free. Distances are sums of
-//! squares of half cells, which are integers, so that all clients get the same bits.
+//! In: a layer of squares. Out: for each cell the distance in metres from its centre to the nearest point of a cell
+//! that is not free, exact up to a bound; 0 in such a cell. What lies outside the grid is not free. Distances are sums
+//! of squares of half cells, which are integers, so that all clients get the same bits.
 
 use clearway_proto::grid::Grid;
 
-use super::{ClassKind, class_of, kinds};
+use super::kinds::{ClassKind, class_of, kinds};
 use crate::error::ClientError;
 use crate::view::MapView;
 

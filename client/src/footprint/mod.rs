@@ -2,14 +2,15 @@
 //! the next cell is that is not free.
 //!
 //! In: a layer with classes, and an area, a path or a point in the ego frame (x forward, y left, metres). Out: answers
-//! from the meanings in the layer's legend. They consider every cell that an area touches, its border included. Only the
-//! meaning free is free; ground outside the grid is not free. A low thing, which some vehicles clear, has an answer of
-//! its own. The Python client gives the same answers (`client/golden/questions.json`).
+//! from the meanings in the layer's legend. They consider every cell that an area touches, its border included. Only
+//! the meaning free is free; ground outside the grid is not free. A low thing, which some vehicles clear, has an answer
+//! of its own. The Python client gives the same answers (`client/golden/questions.json`).
 //!
 //! | file | in -> out |
 //! |---|---|
 //! | [`shape`] | values -> checked areas, outlines and paths |
 //! | `touched` | a polygon -> the cells that it touches |
+//! | `kinds` | a layer -> what its classes are to a vehicle |
 //! | [`clearance`] | a layer -> the distance of every cell to the nearest cell that is not free |
 
 use std::f64::consts::TAU;
@@ -23,9 +24,11 @@ use crate::error::ClientError;
 use crate::view::MapView;
 
 pub mod clearance;
+mod kinds;
 pub mod shape;
 mod touched;
 
+use kinds::{ClassKind, class_name, class_of, kind, kinds};
 use shape::{Area, Outline, Path};
 use touched::{Touched, from_centre, nearest_on, touched};
 
@@ -185,37 +188,6 @@ impl MapView {
         let nearest = found.min_by(|(a, _), (b, _)| a.distance_m.total_cmp(&b.distance_m));
         Ok(nearest.map(|(obstacle, cell)| Obstacle { class: class_name(layer, cell), ..obstacle }))
     }
-}
-
-/// What a class is to a vehicle that drives onto it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum ClassKind {
-    Free,
-    Low,
-    Blocks,
-}
-
-fn kind(class: &Class) -> ClassKind {
-    match class.meaning {
-        ClassMeaning::Free => ClassKind::Free,
-        ClassMeaning::Low => ClassKind::Low,
-        _ => ClassKind::Blocks,
-    }
-}
-
-/// The kinds of a layer's classes, by value.
-fn kinds(layer: &Layer) -> Vec<ClassKind> {
-    layer.legend.iter().map(kind).collect()
-}
-
-/// Class of a cell; `None` without classes.
-fn class_of(layer: &Layer, cell: usize) -> Option<usize> {
-    let raw = layer.channel("class")?.cells.get(cell)?;
-    usize::try_from(raw).ok().filter(|class| *class < layer.legend.len())
-}
-
-fn class_name(layer: &Layer, cell: usize) -> String {
-    class_of(layer, cell).map_or("unknown".into(), |class| layer.legend[class].name.clone())
 }
 
 /// The answer for a polygon; of several cells that forbid it, the one nearest to `from` is named.

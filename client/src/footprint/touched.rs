@@ -11,7 +11,7 @@ use clearway_proto::grid::Grid;
 /// Distance in metres below which a point touches a cell. Ours: far more than the rounding errors of a point on a map.
 const TOUCH_M: f64 = 1e-9;
 
-type Point = [f64; 2];
+type Xy = [f64; 2];
 
 /// The cells that a polygon touches.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -19,11 +19,11 @@ pub struct Touched {
     /// Indices of the cells, each once, ascending.
     pub cells: Vec<usize>,
     /// The first corner outside the grid or on its border; the polygon is wholly inside if `None`.
-    pub outside: Option<Point>,
+    pub outside: Option<Xy>,
 }
 
 /// The cells of a grid that a polygon touches.
-pub fn touched(grid: &Grid, corners: &[Point]) -> Touched {
+pub fn touched(grid: &Grid, corners: &[Xy]) -> Touched {
     let mut cells = Vec::new();
     let is_outside = match grid {
         Grid::Radial { centre_m, row_radius_m, columns } => {
@@ -33,7 +33,7 @@ pub fn touched(grid: &Grid, corners: &[Point]) -> Touched {
         Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let ((sin, cos), edge) = (yaw_rad.sin_cos(), f64::from(*cell_m));
             let in_cells =
-                |[x, y]: &Point| [(x * cos - y * sin - origin_x_m) / edge, (x * sin + y * cos - origin_y_m) / edge];
+                |[x, y]: &Xy| [(x * cos - y * sin - origin_x_m) / edge, (x * sin + y * cos - origin_y_m) / edge];
             let corners: Vec<_> = corners.iter().map(in_cells).collect();
             cartesian(&corners, [*width, *height], TOUCH_M / edge, &mut cells)
         }
@@ -41,25 +41,25 @@ pub fn touched(grid: &Grid, corners: &[Point]) -> Touched {
     cells.sort_unstable();
     cells.dedup();
     let outside = is_outside.then(|| {
-        let leaves = |corner: &&Point| touched_by_point(grid, **corner);
+        let leaves = |corner: &&Xy| touched_by_point(grid, **corner);
         corners.iter().find(leaves).or(corners.first()).copied().unwrap_or_default()
     });
     Touched { cells, outside }
 }
 
 /// True if a point lies outside the grid or on its border.
-fn touched_by_point(grid: &Grid, [x, y]: Point) -> bool {
+fn touched_by_point(grid: &Grid, [x, y]: Xy) -> bool {
     let around = [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]];
     around.into_iter().any(|[dx, dy]| grid.cell_at(x + 2.0 * TOUCH_M * dx, y + 2.0 * TOUCH_M * dy).is_none())
 }
 
 /// A position of the ego frame as seen from the centre of a radial grid.
-pub fn from_centre(centre_m: [f32; 2], [x, y]: Point) -> Point {
+pub fn from_centre(centre_m: [f32; 2], [x, y]: Xy) -> Xy {
     [x - f64::from(centre_m[0]), y - f64::from(centre_m[1])]
 }
 
 /// Adds the touched squares; corners in cells. True if the polygon reaches outside.
-fn cartesian(corners: &[Point], [width, height]: [u32; 2], slack: f64, cells: &mut Vec<usize>) -> bool {
+fn cartesian(corners: &[Xy], [width, height]: [u32; 2], slack: f64, cells: &mut Vec<usize>) -> bool {
     let (low, high) = extent(corners.iter().map(|corner| corner[1]));
     let (first, last) = ((low - slack).floor(), (high + slack).floor());
     let mut is_outside = first < 0.0 || last >= f64::from(height);
@@ -91,7 +91,7 @@ fn cartesian(corners: &[Point], [width, height]: [u32; 2], slack: f64, cells: &m
 }
 
 /// Adds the touched cells of a radial grid; corners about its centre. True if the polygon reaches outside.
-fn radial(corners: &[Point], row_radius_m: &[f32], columns: u32, cells: &mut Vec<usize>) -> bool {
+fn radial(corners: &[Xy], row_radius_m: &[f32], columns: u32, cells: &mut Vec<usize>) -> bool {
     let row = |range_m: f64| row_radius_m.partition_point(|&outer| f64::from(outer) < range_m);
     let direction = |column: f64| (column / f64::from(columns) * TAU).sin_cos();
     let mut is_outside = false;
@@ -117,7 +117,7 @@ fn radial(corners: &[Point], row_radius_m: &[f32], columns: u32, cells: &mut Vec
                 let farthest = part.iter().map(|[x, y]| x.hypot(*y)).fold(0.0, f64::max);
                 add(x.hypot(y) - TOUCH_M, farthest + TOUCH_M);
             }
-            let across = |[x, y]: Point| mid_cos * y - mid_sin * x;
+            let across = |[x, y]: Xy| mid_cos * y - mid_sin * x;
             let (from, to) = (across(a), across(b));
             if (from > 0.0) != (to > 0.0) {
                 let share = from / (from - to);
@@ -137,8 +137,8 @@ fn radial(corners: &[Point], row_radius_m: &[f32], columns: u32, cells: &mut Vec
 }
 
 /// The part of a stretch where `normal · p >= offset`; `None` if there is none.
-fn clip([a, b]: [Point; 2], normal: Point, offset: f64) -> Option<[Point; 2]> {
-    let over = |p: Point| normal[0] * p[0] + normal[1] * p[1] - offset;
+fn clip([a, b]: [Xy; 2], normal: Xy, offset: f64) -> Option<[Xy; 2]> {
+    let over = |p: Xy| normal[0] * p[0] + normal[1] * p[1] - offset;
     let (from, to) = (over(a), over(b));
     let border = || {
         let share = from / (from - to);
@@ -153,12 +153,12 @@ fn clip([a, b]: [Point; 2], normal: Point, offset: f64) -> Option<[Point; 2]> {
 }
 
 /// The edges of a polygon, the last one back to the first corner.
-pub fn edges(polygon: &[Point]) -> impl Iterator<Item = [Point; 2]> {
+pub fn edges(polygon: &[Xy]) -> impl Iterator<Item = [Xy; 2]> {
     (0..polygon.len()).map(|index| [polygon[index], polygon[(index + 1) % polygon.len()]])
 }
 
 /// The place on a stretch that is nearest to a point.
-pub fn nearest_on([a, b]: [Point; 2], [x, y]: Point) -> Point {
+pub fn nearest_on([a, b]: [Xy; 2], [x, y]: Xy) -> Xy {
     let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
     let squared = dx * dx + dy * dy;
     let share = if squared > 0.0 { (((x - a[0]) * dx + (y - a[1]) * dy) / squared).clamp(0.0, 1.0) } else { 0.0 };

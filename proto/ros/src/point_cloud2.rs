@@ -108,8 +108,8 @@ impl<'a> PointCloud2<'a> {
     /// Reads a message.
     ///
     /// # Errors
-    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if there are too many fields, or if rows and points do
-    /// not fit into one another.
+    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if there are too many fields, or if rows and points
+    /// do not fit into one another.
     pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
         let mut reader = Reader::new(message)?;
         let header = reader.header()?;

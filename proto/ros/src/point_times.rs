@@ -23,9 +23,9 @@ const UNITS: [f64; 4] = [1.0, 1e3, 1e6, 1e9];
 /// [`MessageError::Value`] if no unit and origin fit, or if all times are the same, which says nothing of the points.
 pub(crate) fn offsets(times: &[f64], datatype: Datatype, header_ns: i64) -> Result<Vec<Option<i64>>, MessageError> {
     let is_float = matches!(datatype, Datatype::Float32 | Datatype::Float64);
-    let [seconds, milliseconds, microseconds, nanoseconds] = UNITS.map(Reading::AfterStamp);
+    let [seconds, milliseconds, microseconds, nanoseconds] = UNITS.map(TimeReading::AfterStamp);
     let since_epoch = match datatype {
-        Datatype::Float64 | Datatype::Int64 | Datatype::Uint64 => &UNITS.map(Reading::SinceEpoch)[..],
+        Datatype::Float64 | Datatype::Int64 | Datatype::Uint64 => &UNITS.map(TimeReading::SinceEpoch)[..],
         // Fewer bits hold no time since the epoch.
         _ => &[],
     };
@@ -53,7 +53,7 @@ pub(crate) fn offsets(times: &[f64], datatype: Datatype, header_ns: i64) -> Resu
         let (first_ns, last_ns) = fitting().min().zip(fitting().max()).map_or((0, 0), |(first, last)| (*first, *last));
         let span_ns = last_ns - first_ns;
         // Times of a clock that began with the device are small too, but far from the header.
-        let is_rare = index > 0 && matches!(reading, Reading::AfterStamp(_));
+        let is_rare = index > 0 && matches!(reading, TimeReading::AfterStamp(_));
         let is_apart = is_rare && (first_ns > span_ns || last_ns < -span_ns);
         let is_too_fast = !is_float && n >= RATED_POINTS && n as f64 > span_ns as f64 * POINTS_PER_NS_MAX;
         if 10 * n >= 9 * times.len() && !is_too_fast && !is_apart {
@@ -65,12 +65,12 @@ pub(crate) fn offsets(times: &[f64], datatype: Datatype, header_ns: i64) -> Resu
 
 /// How a number is read as a time; the value is the number of units a second.
 #[derive(Clone, Copy)]
-enum Reading {
+enum TimeReading {
     AfterStamp(f64),
     SinceEpoch(f64),
 }
 
-impl Reading {
+impl TimeReading {
     fn offset_ns(self, time: f64, header_ns: i64) -> Option<i64> {
         let offset_ns = match self {
             _ if !time.is_finite() => None,

@@ -65,8 +65,8 @@ impl<'a> Odometry<'a> {
     /// Reads a message.
     ///
     /// # Errors
-    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if a number of the pose is not finite or its quaternion
-    /// is not of length 1.
+    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if a number of the pose is not finite or its
+    /// quaternion is not of length 1.
     pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
         let mut reader = Reader::new(message)?;
         let header = reader.header()?;

@@ -60,8 +60,8 @@ pub struct EvaluateArguments {
     /// lasers16 (of 64), offset+1.5 (the sensor is 1.5 m ahead of the ego origin).
     #[arg(long, value_name = "NAME", value_delimiter = ',', default_value = "recorded")]
     variations: Vec<String>,
-    /// Cut objects into each labelled scan by ray geometry (a box, a log, a kerb, a person who lies, a pole, a trench, at
-    /// 7, 10, 15 and 20 m) and count their cells that are called free.
+    /// Cut objects into each labelled scan by ray geometry (a box, a log, a kerb, a person who lies, a pole, a trench,
+    /// at 7, 10, 15 and 20 m) and count their cells that are called free.
     #[arg(long)]
     objects: bool,
     /// Write each scan and its truth to this folder, for other programs, but not those of sim:NAME other than

@@ -3,8 +3,8 @@
 //! planned move. Each revolution makes one map and one move. The loop waits for each map and never for the clock, so
 //! that every run drives the same way.
 //!
-//! Three programs drive: A* on the layer `speed`, the follower of the safe points on the layer `safe_path`, and arcs over
-//! the layer `freespace`, by its answers alone.
+//! Three programs drive: A* on the layer `speed`, the follower of the safe points on the layer `safe_path`, and arcs
+//! over the layer `freespace`, by its answers alone.
 
 #[allow(dead_code, reason = "the example has a goal straight ahead")]
 #[path = "../../../client/examples/free_arcs/arcs.rs"]

@@ -24,8 +24,8 @@ pub struct Recorder {
     /// Time in seconds after which the next part begins; 0: no limit.
     pub part_s: u64,
     /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded: more
-    /// than the time for which any layer remembers ([`GROUND_S_MAX`](clearway_mapping::memory::config::GROUND_S_MAX)), else
-    /// each new part would change the maps. A constant but in tests.
+    /// than the time for which any layer remembers ([`GROUND_S_MAX`](clearway_mapping::memory::config::GROUND_S_MAX)),
+    /// else each new part would change the maps. A constant but in tests.
     #[serde(skip)]
     pub warm_up_ms: u64,
     /// Total length in MiB beyond which the oldest parts are deleted; 0: none is.

@@ -68,7 +68,8 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// Starts the thread, which computes with a permit of `permits`. It ends when the vehicle's queue is closed and empty.
+    /// Starts the thread, which computes with a permit of `permits`. It ends when the vehicle's queue is closed and
+    /// empty.
     ///
     /// # Errors
     /// [`std::io::Error`] if the system cannot create a thread.

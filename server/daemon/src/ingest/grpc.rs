@@ -161,7 +161,7 @@ impl IngestStream {
                 () = self.gateways.stopped(), if self.observations.is_some() => {
                     self.stop_reading(Some(Status::unavailable("the server stops")));
                 }
-                Some((observation, permit)) = OptionFuture::from(self.waiting.as_mut()) => self.push(observation, permit),
+                Some((waited, permit)) = OptionFuture::from(self.waiting.as_mut()) => self.push(waited, permit),
                 observation = next_observation(&mut self.observations), if has_credit => match observation {
                     Ok(Some(observation)) => self.wait_for_admission(observation),
                     Ok(None) => self.stop_reading(None),

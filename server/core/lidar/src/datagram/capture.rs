@@ -1,8 +1,8 @@
 //! pcap and pcapng captures to UDP payloads.
 //!
-//! In: the bytes of a capture (Ethernet with or without VLAN tags, Linux cooked, raw IP, the loopback of BSD and Windows). Out: [`Datagram`]s in file
-//! order. Packets that are not a complete UDP datagram are skipped and counted. A file that ends inside a packet gives
-//! all datagrams before that packet, then an error with the position in the file.
+//! In: the bytes of a capture (Ethernet with or without VLAN tags, Linux cooked, raw IP, the loopback of BSD and
+//! Windows). Out: [`Datagram`]s in file order. Packets that are not a complete UDP datagram are skipped and counted. A
+//! file that ends inside a packet gives all datagrams before that packet, then an error with the position in the file.
 
 use std::io::Read;
 use std::net::{IpAddr, SocketAddr};

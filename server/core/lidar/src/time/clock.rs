@@ -86,8 +86,8 @@ const EARLIEST_NS: i64 = 1_104_537_600 * NS_PER_SECOND;
 /// Default of [`crate::SensorConfig::gps_late_ns_max`], in ns: 24 hours. The clock of a host may be wrong by hours
 /// (time zone, battery) but not by days, while the error of a receiver is 1024 weeks.
 pub const GPS_LATE_NS_MAX: i64 = 24 * NS_PER_HOUR;
-/// Time, in ns, by which the limit of GPS time ahead of arrival is less than the limit behind. Ours: a receiver with the
-/// date of tomorrow is then beyond it, and a host whose time zone is wrong is within it.
+/// Time, in ns, by which the limit of GPS time ahead of arrival is less than the limit behind. Ours: a receiver with
+/// the date of tomorrow is then beyond it, and a host whose time zone is wrong is within it.
 const GPS_AHEAD_LESS_NS: i64 = 6 * NS_PER_HOUR;
 /// Latest arrival, in ns since the Unix epoch: the year 2096. Later arrivals are replaced by it, because stamps near
 /// the end of 64 bits would overflow.

@@ -158,8 +158,8 @@ impl RadialGrid {
     }
 
     /// Calls `visit(first_point, cells)` for each chunk of the sweep. A point beyond the last row falls into the row
-    /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. `azimuths` are those of the points about the ego origin in columns of two
-    /// degrees, if they are known.
+    /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. `azimuths` are the
+    /// azimuths of the points about the ego origin in columns of two degrees, if they are known.
     pub fn for_each_chunk(&self, sweep: &Sweep, azimuths: Option<&[f32]>, mut visit: impl FnMut(usize, &[u32])) {
         let mut ranges_squared = [0.0f32; CHUNK];
         let mut cells = [0u32; CHUNK];

@@ -16,8 +16,8 @@ pub(super) const OBSTACLE_S_MAX: f32 = 0.3;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MemoryConfig {
-    /// True if ground that was seen in earlier maps is carried into the newest one. It needs ego poses; without them, and
-    /// in directions without a return, where the sensor may be covered, nothing is carried.
+    /// True if ground that was seen in earlier maps is carried into the newest one. It needs ego poses; without them,
+    /// and in directions without a return, where the sensor may be covered, nothing is carried.
     pub enabled: bool,
 }
 

@@ -61,6 +61,8 @@ pub(crate) struct Memory {
     /// Points of the newest map and the remembered ones.
     extended: Sweep,
     azimuths: AzimuthColumns,
+    /// One bit for each stored cell, set if the newest map has a point there.
+    seen: Vec<u64>,
     /// What the newest map got.
     state: MemoryState,
 }
@@ -83,6 +85,7 @@ impl Memory {
             newest: None,
             extended: Sweep::default(),
             azimuths: AzimuthColumns::new(AzimuthColumns::TWO_DEGREES),
+            seen: vec![0; (SIDE * SIDE / 64) as usize],
             state: MemoryState::default(),
         })
     }
@@ -174,10 +177,10 @@ impl Memory {
     /// Adds a point for each remembered cell near the vehicle in which the map has no point itself.
     fn recall(&mut self, map_from_ego: &Isometry3<f64>) {
         let ego_from_map = map_from_ego.inverse();
-        let seen = self.seen_cells(map_from_ego);
-        let in_view = self.directions_in_view(&seen, &ego_from_map, map_from_ego);
+        self.find_seen_cells(map_from_ego);
+        let in_view = self.directions_in_view(&ego_from_map, map_from_ego);
         for &index in &self.listed {
-            if seen[index as usize / 64] >> (index % 64) & 1 != 0 {
+            if self.seen[index as usize / 64] >> (index % 64) & 1 != 0 {
                 continue;
             }
             let cell = &self.cells[index as usize];
@@ -191,11 +194,11 @@ impl Memory {
         }
     }
 
-    /// One bit for each stored cell, set if the map has a point there.
-    fn seen_cells(&self, map_from_ego: &Isometry3<f64>) -> Vec<u64> {
-        let mut seen = vec![0_u64; (SIDE * SIDE / 64) as usize];
+    /// Finds the stored cells in which the map has a point.
+    fn find_seen_cells(&mut self, map_from_ego: &Isometry3<f64>) {
+        let Self { seen, extended: sweep, .. } = self;
+        seen.fill(0);
         let range_squared = RANGE_M_MAX * RANGE_M_MAX;
-        let sweep = &self.extended;
         for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
             if x * x + y * y <= range_squared {
                 let point = map_from_ego * Point3::new(x, y, z).cast::<f64>();
@@ -204,21 +207,15 @@ impl Memory {
                 seen[index / 64] |= 1 << (index % 64);
             }
         }
-        seen
     }
 
     /// By direction of two degrees: true if the map has a point there, or in a direction beside it, within the range of
     /// the memory. In other directions the sensor may be covered, so that nothing is known there now.
-    fn directions_in_view(
-        &self,
-        seen: &[u64],
-        ego_from_map: &Isometry3<f64>,
-        map_from_ego: &Isometry3<f64>,
-    ) -> [bool; DIRECTIONS] {
+    fn directions_in_view(&self, ego_from_map: &Isometry3<f64>, map_from_ego: &Isometry3<f64>) -> [bool; DIRECTIONS] {
         let middle = map_from_ego.translation.vector;
         let first = [middle.x, middle.y].map(|metres| (metres / CELL_M).floor() as i64 - SIDE / 2);
         let mut in_view = [false; DIRECTIONS];
-        for (word, bits) in seen.iter().enumerate() {
+        for (word, bits) in self.seen.iter().enumerate() {
             let mut rest = *bits;
             while rest != 0 {
                 let index = word as i64 * 64 + i64::from(rest.trailing_zeros());

@@ -22,8 +22,8 @@ pub struct ReachConfig {
     /// Least height of an obstacle over the local ground, metres; the vehicle drives over lower ones. 0.25 is ours: one
     /// unit of the layer `drivability`.
     pub obstacle_m_min: f32,
-    /// Ground clearance of the vehicle, metres: the layer `freespace` calls a thing between it and `obstacle_m_min` low.
-    /// At most `obstacle_m_min`. 0.15 is ours, a car.
+    /// Ground clearance of the vehicle, metres: the layer `freespace` calls a thing between it and `obstacle_m_min`
+    /// low. At most `obstacle_m_min`. 0.15 is ours, a car.
     pub clearance_m: f32,
     /// Greatest height of an obstacle over the local ground, metres; the vehicle passes under higher ones. 2.5: UT
     /// Austin thesis, section IV.2.

@@ -315,8 +315,8 @@ impl Reach {
         self.steps.spans_mm()
     }
 
-    /// Calls `mark` with the higher cell of each step of the ground of at least this height, up to `near` cells from the
-    /// middle.
+    /// Calls `mark` with the higher cell of each step of the ground of at least this height, up to `near` cells from
+    /// the middle.
     pub(crate) fn each_step(&self, least_m: f32, near: usize, mut mark: impl FnMut(usize)) {
         self.steps.find(least_m, near, |higher, _| mark(higher));
     }

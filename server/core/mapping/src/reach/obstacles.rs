@@ -46,8 +46,8 @@ impl Obstacles {
         self.spans_m[cell][1] - self.spans_m[cell][0]
     }
 
-    /// Lowest and highest height of a cell's returns over the ground, metres; the lowest is the larger number without an
-    /// obstacle.
+    /// Lowest and highest height of a cell's returns over the ground, metres; the lowest is the larger number without
+    /// an obstacle.
     pub fn span_m(&self, cell: usize) -> [f32; 2] {
         self.spans_m[cell]
     }

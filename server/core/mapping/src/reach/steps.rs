@@ -47,8 +47,8 @@ impl Steps {
         }
     }
 
-    /// Calls `mark` with the higher and the lower cell of each step of at least this height, up to `near` cells from the
-    /// middle; both are the same for a step within a cell.
+    /// Calls `mark` with the higher and the lower cell of each step of at least this height, up to `near` cells from
+    /// the middle; both are the same for a step within a cell.
     pub fn find(&self, least_m: f32, near: usize, mut mark: impl FnMut(usize, usize)) {
         let least_mm = (least_m * 1000.0) as i32;
         let reaches = NEAR.map(|[dx, dy]| {

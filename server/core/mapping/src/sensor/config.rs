@@ -44,14 +44,15 @@ pub struct SensorConfig {
     /// and the cells there stay unknown.
     #[serde(default)]
     pub blind_deg: Vec<[f32; 2]>,
-    /// Greatest difference between GPS time and arrival, days. If GPS time is older, or ahead of arrival by as much less
-    /// six hours, the stamps of the sensor follow the host's clock: then a capture is played live, or the receiver's date
-    /// is wrong.
+    /// Greatest difference between GPS time and arrival, days. If GPS time is older, or ahead of arrival by as much
+    /// less six hours, the stamps of the sensor follow the host's clock: then a capture is played live, or the
+    /// receiver's date is wrong.
     #[serde(default = "default_gps_late_days_max")]
     pub gps_late_days_max: f64,
     /// Elevation of each laser, degrees; for a sensor that sends scans. They come before those of the model. Without
     /// either, the elevations are measured from the rings of the first scan; if that has no rings, from the order and
-    /// the elevations of its points; if these show no lasers, the rows of radial maps that this sensor defines have the same depth.
+    /// the elevations of its points; if these show no lasers, the rows of radial maps that this sensor defines have the
+    /// same depth.
     #[serde(default)]
     pub elevations_deg: Vec<f32>,
     /// Standard deviation of the sensor's range noise, metres; the roughness of the ground is measured without it.

@@ -96,7 +96,8 @@ pub enum ElevationSource {
     Rings,
     /// The points of a scan that states no rings.
     Estimated,
-    /// None: a scan states no rings and does not show them. The rows of radial maps that the sensor defines have the same depth.
+    /// None: a scan states no rings and does not show them. The rows of radial maps that the sensor defines have the
+    /// same depth.
     Unknown,
 }
 

@@ -1,5 +1,7 @@
 //! The layer `freespace`: what is never free, and what is found.
 
+use std::f32::consts::{PI, TAU};
+
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{FreespaceConfig, ReachConfig};
 use clearway_mapping::layer::freespace::Freespace;
@@ -99,7 +101,7 @@ fn a_log_is_low_and_a_trench_is_a_drop() {
 fn the_sector_of_a_covered_sensor_is_never_free() {
     for middle in [0.0_f32, 1.0, 2.0, 3.0] {
         let whole = cast(Model::Hdl64eS2, plain);
-        let off = |x: f32, y: f32| (libm::atan2f(y, x) - middle + 9.424_778) % 6.283_185 - 3.141_593;
+        let off = |x: f32, y: f32| (libm::atan2f(y, x) - middle + 3.0 * PI) % TAU - PI;
         let mut sweep = empty(Model::Hdl64eS2);
         for ((x, y), z) in whole.x.iter().zip(&whole.y).zip(&whole.z) {
             if off(*x, *y).abs() > 0.5 {

@@ -10,15 +10,12 @@ use clearway_ros::{Frames, Kind};
 use nalgebra::{Isometry3, Translation3};
 
 use super::available::{AvailableTopics, Topic};
-use super::decoder::{PoseSource, TopicDecoder};
+use super::decoder::{PoseSource, RAISED_M, TopicDecoder};
 use clearway_journal::reader::RecordingError;
 
 /// The vehicle's frame: the first of these in the tf tree, with or without a namespace. REP-120 puts `base_footprint`
 /// on the ground.
 const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
-/// Height over the ground from which a cloud in the vehicle's frame is taken to be seen, in metres. Ours, about the roof
-/// of a car.
-pub(super) const RAISED_M: f64 = 2.0;
 /// Plausible heights of a sensor above the ground, in metres. A transform with another height belongs to an ego frame
 /// that is not on the ground.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.1..=20.0;

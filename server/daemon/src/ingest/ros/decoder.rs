@@ -17,8 +17,11 @@ use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points, RefusedPart};
 use nalgebra::{Isometry3, Vector3};
 
-use super::choice::RAISED_M;
 use crate::ingest::queue::Reading;
+
+/// Height over the ground from which a cloud in the vehicle's frame is taken to be seen, in metres. Ours, about the
+/// roof of a car.
+pub(super) const RAISED_M: f64 = 2.0;
 
 /// The source of the ego poses.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -189,8 +192,8 @@ impl TopicDecoder {
     }
 
     /// The ego pose with its speed, computed from the forward distance since the pose before. `None` for the first
-    /// pose, for a repeated stamp, and if the stamps step back: the poses after the step are computed from this one, and
-    /// the pipeline decides whether an epoch has begun.
+    /// pose, for a repeated stamp, and if the stamps step back: the poses after the step are computed from this one,
+    /// and the pipeline decides whether an epoch has begun.
     fn pose_with_speed(&mut self, stamp_ns: i64, map_from_ego: Isometry3<f64>) -> Option<EgoPose> {
         if self.newest.is_some_and(|(before_ns, _)| before_ns == stamp_ns) {
             return None;

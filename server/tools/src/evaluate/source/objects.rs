@@ -1,9 +1,9 @@
 //! Objects cut into labelled scans by ray geometry -> how many of their cells each layer calls free.
 //!
-//! In: a recorded scan and the truth of its points. Out: counts by object and distance, in an [`EvaluatedSource`]. A ray
-//! that meets the object before its recorded return ends on the object, without noise; a return inside a trench moves on
-//! to its floor or far wall. Each object stands alone, on the first open level ground at its distance, and is judged by
-//! one scan.
+//! In: a recorded scan and the truth of its points. Out: counts by object and distance, in an [`EvaluatedSource`]. A
+//! ray that meets the object before its recorded return ends on the object, without noise; a return inside a trench
+//! moves on to its floor or far wall. Each object stands alone, on the first open level ground at its distance, and is
+//! judged by one scan.
 
 use std::collections::BTreeSet;
 
@@ -18,8 +18,7 @@ use super::super::footprint::ground::{FreeGround, Surface, squares_within};
 use super::super::judge::{JudgedPoint, Scored, locate, meanings};
 use super::super::report::EvaluatedSource;
 use super::super::tally::CellCount;
-use super::pipeline;
-use super::scans::step;
+use super::one_sensor::{pipeline, step};
 
 /// Distances of the objects from the sensor, in metres.
 pub const DISTANCES_M: [f32; 4] = [7.0, 10.0, 15.0, 20.0];

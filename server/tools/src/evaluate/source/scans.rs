@@ -10,7 +10,7 @@ use anyhow::{Context, Result, anyhow, bail};
 use clearway_daemon::ingest::files::kitti;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig};
-use clearway_mapping::event::{Body, Event, Scan};
+use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::mount::estimate;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
@@ -20,8 +20,8 @@ use super::super::options::EvaluateOptions;
 use super::super::report::{EvaluatedSource, FrameTruth};
 use super::labels;
 use super::objects::judge_objects;
+use super::one_sensor::{pipeline, step};
 use super::pairs::LabelledScan;
-use super::pipeline;
 use super::variation::Variation;
 use super::written::{WrittenFrame, write};
 
@@ -152,12 +152,6 @@ impl TruthMaker {
         }
         Ok(points)
     }
-}
-
-pub(super) fn step(pipeline: &mut Pipeline, scan: Scan, sequence: u64, file: &Path) -> Result<()> {
-    let event = Event { sequence, arrival_ns: scan.stamp_ns, source: 0, body: Body::Scan(scan) };
-    pipeline.step(&event).with_context(|| file.display().to_string())?;
-    Ok(())
 }
 
 /// Checks KITTI's mount against the ground in the scans; returns the reason for using it, for the report.

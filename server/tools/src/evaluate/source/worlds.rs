@@ -18,7 +18,7 @@ use clearway_sim::vehicle::SimulatedVehicle;
 use super::super::footprint::ground::KnownPlace;
 use super::super::judge::{JudgedPoint, OBSTACLE_M_MAX, OBSTACLE_M_MIN, Scored, Vote};
 use super::super::report::{EvaluatedSource, FrameTruth, UNREACHABLE};
-use super::pipeline;
+use super::one_sensor::pipeline;
 use crate::scenes::NamedScene;
 
 /// Half the edge of the truth's grid and the edge of its cells, in metres.

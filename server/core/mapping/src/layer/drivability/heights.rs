@@ -60,8 +60,8 @@ impl Heights {
         }
     }
 
-    /// Makes the empty cells before the first return of each column level ground, as under the vehicle: the thesis takes
-    /// the vehicle's own cell as the start, and no return falls near it.
+    /// Makes the empty cells before the first return of each column level ground, as under the vehicle: the thesis
+    /// takes the vehicle's own cell as the start, and no return falls near it.
     pub fn fill_blind_zone(&mut self, grid: &RadialGrid, config: &DrivabilityConfig) {
         let [x, y] = grid.centre_m();
         for column in 0..grid.columns() {

@@ -111,10 +111,10 @@ impl Drops {
     /// Slope of the ground before a return of the column.
     fn slope(&self, at: usize) -> f32 {
         let Return { range_m, z_m } = self.returns[at];
-        let back = self.returns[..at].iter().rev().filter(|back| range_m - back.range_m >= BACK_M / 5.0);
+        let mut back = self.returns[..at].iter().rev().filter(|back| range_m - back.range_m >= BACK_M / 5.0);
         let far = back.clone().find(|back| range_m - back.range_m >= BACK_M);
         let slope = |back: &Return| (z_m - back.z_m) / (range_m - back.range_m);
-        far.or_else(|| back.last()).map_or(0.0, slope).clamp(-SLOPE_MAX, SLOPE_MAX)
+        far.or_else(|| back.next_back()).map_or(0.0, slope).clamp(-SLOPE_MAX, SLOPE_MAX)
     }
 
     fn mark(&mut self, reach: &Reach) {
@@ -129,7 +129,7 @@ impl Drops {
         // The sides of a trench fill a part of their columns only.
         let wide =
             |column: usize| [-1, 0, 1].map(|offset| agreed(beside(column, offset))).into_iter().fold(0, |a, b| a | b);
-        let spans: Vec<u128> = (0..COLUMNS).map(wide).collect();
+        let spans: [u128; COLUMNS] = std::array::from_fn(wide);
         let half = ((RANGE_M_MAX + GAP_M.end) / CELL_M) as usize;
         let near = SIDE / 2 - half..SIDE / 2 + half;
         for (ix, iy) in near.clone().flat_map(|iy| near.clone().map(move |ix| (ix, iy))) {
