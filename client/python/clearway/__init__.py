@@ -47,13 +47,13 @@ def watch(
 
     `vehicle` may be empty over gRPC if the server has a single vehicle. `layers` are names, or one name; without them
     every layer is sent; over zenoh vehicle and layers must be named. With `tls` the connection is encrypted. The other
-    arguments are for gRPC: at most `max_in_flight` maps are sent without an acknowledgement, and at most `max_rate_hz` maps per second. Each layer is
-    cut to the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With `deltas`, layers are sent as
-    changes from the map before: fewer bytes, the same maps. With `replay_clock`, a map is as old as it was when it was
-    made, plus the time since it came: for a replay that keeps the recorded stamps. Errors of the server are raised by
-    the first `next`; for an unknown vehicle or layer the message lists the known ones. For zenoh: with `signed_by`,
-    the PEM file of a server's public key, only maps that this server has signed are believed; `MapStream.passed_over`
-    counts the others.
+    arguments are for gRPC: at most `max_in_flight` maps are sent without an acknowledgement, and at most `max_rate_hz`
+    maps per second. Each layer is cut to the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With
+    `deltas`, layers are sent as changes from the map before: fewer bytes, the same maps. With `replay_clock`, a map is
+    as old as it was when it was made, plus the time since it came: for a replay that keeps the recorded stamps. Errors
+    of the server are raised by the first `next`; for an unknown vehicle or layer the message lists the known ones. For
+    zenoh: with `signed_by`, the PEM file of a server's public key, only maps that this server has signed are believed;
+    `MapStream.passed_over` counts the others.
     """
     _check_signed_by(address, signed_by)
     layers = _names(layers)

@@ -5,7 +5,7 @@
 //! | position | `x` `y` `z`, float32 or float64 | metres; NaN, or 0 for all three, means a ray without a return |
 //! | intensity | `intensity`, else `reflectivity`, any type | 0 to 1 after scaling, see below |
 //! | ring | `ring`, `channel` (nebula), `laser_id`, `line` (Livox), whole numbers of any type | rank by elevation |
-//! | time | `time` (Velodyne), `t` (Ouster), `timestamp` (Hesai, RoboSense), `time_stamp` (nebula), `offset_time` | see `point_times` |
+//! | time | `time`, `t`, `timestamp`, `time_stamp`, `offset_time` | `point_times` |
 //!
 //! Intensities: integers are divided by the greatest value of their type; floats stay as they are, or are divided by
 //! 255 if one of them is above 1. Rings of drivers that number from the top (Ouster, Hesai) are reversed.

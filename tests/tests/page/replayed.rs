@@ -62,13 +62,13 @@ pub fn cells_are_those_of_the_client() {
             let at = "return document.querySelector('#cell p').textContent.match(/x (-?[0-9.]+) m, y (-?[0-9.]+)/)
                 .slice(1).map(Number)";
             // The page answers a move of the cursor with the next message of its worker.
-            let expected = [1.0, 11.0, 11.0, 11.0][compared / 6];
+            let expected = [1.0, 11.0, 11.0, 11.0][compared / 7];
             browser.until("the cursor's place", &format!("const [x] = (() => {{ {at} }})(); return x === {expected}"));
-            let left = [0.0, 0.0, 3.0, -7.0][compared / 6];
+            let left = [0.0, 0.0, 3.0, -7.0][compared / 7];
             browser.until("the cursor's place", &format!("const [, y] = (() => {{ {at} }})(); return y === {left}"));
             let shown = browser.run(CELL);
             let shown = shown.as_array().expect("a list");
-            assert_eq!(shown.len(), 6, "{shown:?}");
+            assert_eq!(shown.len(), 7, "{shown:?}");
             for entry in shown {
                 let name = entry[0].as_str().expect("a name");
                 let layer = map.layer(name).expect("a layer of the map");
@@ -83,7 +83,7 @@ pub fn cells_are_those_of_the_client() {
                 compared += 1;
             }
         }
-        assert_eq!(compared, 24);
+        assert_eq!(compared, 28);
         browser.screenshot("replay-1440x900");
     });
 }

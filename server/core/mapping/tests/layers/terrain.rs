@@ -433,8 +433,7 @@ fn flat_cells_of_the_simulated_worlds_contain_no_object() {
 
 #[test]
 fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
-    // A cell on the line of the fence may contain ground of both sides. Under the canopy thin shadows lead on behind the
-    // fence from 25 m on, where it returns nothing between its posts.
+    // A cell on the line of the fence may contain ground of both sides; thin shadows lead on behind it from 25 m on.
     for (scene, behind_min, reached_max) in
         [(scenes::fenced_road_under_canopy(), 1500, 70), (scenes::fenced_road_with_low_overhang(), 2000, 10)]
     {
