@@ -148,12 +148,15 @@ fn with_field(points: u32, name: &'static str, datatype: u8, number: impl Fn(u32
 
 const HEADER_NS: i64 = 1_700_000_000_500_000_000;
 
+/// The bytes of the time of a point.
+type TimeBytes = Box<dyn Fn(u32) -> Vec<u8>>;
+
 #[test]
 fn the_unit_and_the_origin_of_times_are_found_from_their_values() {
     // 20,000 points in 0.1 s.
     let us = |point: u32| u64::from(5 * point);
-    let epoch_us = |point: u32| HEADER_NS as u64 / 1000 + us(point);
-    let cases: [(&str, u8, Box<dyn Fn(u32) -> Vec<u8>>); 11] = [
+    let epoch_us = move |point: u32| HEADER_NS as u64 / 1000 + us(point);
+    let cases: [(&str, u8, TimeBytes); 11] = [
         ("float32 s", 7, Box::new(move |p| (us(p) as f32 * 1e-6).to_le_bytes().to_vec())),
         ("float32 ms", 7, Box::new(move |p| (us(p) as f32 * 1e-3).to_le_bytes().to_vec())),
         ("float32 us", 7, Box::new(move |p| (us(p) as f32).to_le_bytes().to_vec())),
