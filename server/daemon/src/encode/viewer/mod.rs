@@ -1,4 +1,4 @@
-//! Maps for ROS 2 and Foxglove: messages of one [`MapView`](clearway_client::MapView).
+//! Maps for ROS 2 and Foxglove: messages of one [`MapView`].
 //!
 //! Frames: grids and points in `<vehicle>/base_link`, the ego frame; if poses are known, that frame in `map`. Every
 //! stamp is the end of the capture.
