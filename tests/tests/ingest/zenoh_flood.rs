@@ -19,12 +19,12 @@ async fn a_flood_of_large_scans_over_zenoh_costs_another_session_no_observation(
     let mut config = scanned_config();
     config.zenoh.enabled = true;
     // So that a scan of the longest message is little work also for a busy test machine.
-    config.vehicles[0].ingest.points_max = 60_000;
+    config.vehicles[0].ingest.points_max = 20_000;
     let running = start(config, &folder.path().join("flood.mcap")).await;
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
 
     // The stamp is older than any other, so that the engine refuses the scans and makes no map of them.
-    let floats: Bytes = vec![0; 4 * 60_000].into();
+    let floats: Bytes = vec![0; 4 * 20_000].into();
     let scan = scan(1, v1::Scan { stamp_ns: 1, x: floats.clone(), y: floats.clone(), z: floats, ..Default::default() });
     let mut settings = zenoh::Config::default();
     settings.insert_json5("mode", "\"client\"").unwrap();
@@ -53,7 +53,8 @@ async fn a_flood_of_large_scans_over_zenoh_costs_another_session_no_observation(
     let client = within("zenoh", ZenohClient::connect(&endpoint)).await.unwrap();
     let mut car = within("an ingester", client.ingest("car")).await.unwrap();
     let poses = (1..=500).map(|number: i64| {
-        let stamp_ns = number * 10_000_000;
+        // All within 50 ms after the scans, so that no scan begins an epoch.
+        let stamp_ns = number * 100_000;
         Observation::pose(stamp_ns, [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0).captured_at(stamp_ns)
     });
     assert_eq!(send_all(&mut car, poses.collect()).await, []);
