@@ -266,7 +266,7 @@ fn every_command_knows_a_capture_by_its_first_bytes_and_says_if_it_is_empty() {
     std::fs::write(folder.path().join("drive.mcap"), header).unwrap();
     for (command, more, code, expected) in [
         ("info", &[][..], 0, "kind: capture"),
-        ("replay", &[], 2, "of 0 received"),
+        ("replay", &[], 2, "the files hold no packet, scan or message that is read"),
         ("send", &["--to", "udp://127.0.0.1:9"], 2, "has no Velodyne datagram"),
     ] {
         let output = clearway_tests::run(folder.path(), "clearway", &[&[command, "drive.mcap"], more].concat());
