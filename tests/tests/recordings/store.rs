@@ -142,7 +142,7 @@ async fn a_part_is_deleted_only_if_it_is_the_part_that_was_confirmed() {
     let confirmation = upload::upload(&*store, &part, None).await.unwrap();
     let expected = Entry::of_part(&part, confirmation.bytes, confirmation.crc32).unwrap();
     assert_eq!(search(&*store, &Search::default()).await.unwrap().entries, expected);
-    assert_eq!((expected[0].events, expected[0].layers), (172, 18));
+    assert_eq!((expected[0].events, expected[0].layers), (172, 21));
     // Another recording with the name of the confirmed one is another part.
     let bytes = std::fs::read(&part).unwrap();
     std::fs::write(&part, &bytes[..bytes.len() - 1]).unwrap();

@@ -118,9 +118,8 @@ const CONSTANTS: [(&str, &str, &str); 57] = [
 ];
 
 /// Keys of other tables that earlier versions had. They changed no map.
-const REMOVED: [(&str, &str); 7] = [
+const REMOVED: [(&str, &str); 6] = [
     ("recorder", "queue"),
-    ("recorder", "warm_up_ms"),
     ("recorder", "chunk_kb"),
     ("recorder", "compression"),
     ("traces", "one_in"),
