@@ -83,6 +83,11 @@ impl Bits {
         self.words.iter_mut().zip(&other.words).for_each(|(word, other)| *word &= !other);
     }
 
+    /// Clears the bits that are not set in an equally large square.
+    pub fn keep(&mut self, other: &Self) {
+        self.words.iter_mut().zip(&other.words).for_each(|(word, other)| *word &= other);
+    }
+
     /// The words, row by row.
     pub fn words(&self) -> &[u64] {
         &self.words

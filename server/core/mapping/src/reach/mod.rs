@@ -388,16 +388,20 @@ impl Reach {
     }
 
     /// Opens the hidden cells in gaps of seen ground that a closing of the open cells fills: the thin shadows of trunks
-    /// and bushes, which would cut the way of the disc's middle.
+    /// and bushes, which would cut the way of the disc's middle. Near ground alone: [`Directions::near`].
     fn open_thin_shadows(&mut self) {
-        let Self { open, hidden_gaps, dilated, outside, wide, .. } = self;
+        let Self { open, hidden_gaps, dilated, outside, wide, directions, .. } = self;
         dilated.clear();
         dilated.dilate(open, CLOSING, wide);
         dilated.invert();
         outside.clear();
         outside.dilate(dilated, CLOSING, wide);
         hidden_gaps.remove(outside);
-        self.open.add(&self.hidden_gaps);
+        // Farther away a fence returns nothing between its posts, and shadows would lead on behind it.
+        if let Some(near) = directions.near().last() {
+            hidden_gaps.keep(near);
+        }
+        open.add(hidden_gaps);
     }
 
     /// Decides for each polar cell whether its unseen ground counts as free of obstacles.

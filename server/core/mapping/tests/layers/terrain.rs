@@ -433,9 +433,8 @@ fn flat_cells_of_the_simulated_worlds_contain_no_object() {
 
 #[test]
 fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
-    // A cell on the line of the fence may contain ground of both sides; thin shadows lead on behind it from 25 m on.
-    for (scene, behind_min, reached_max) in
-        [(scenes::fenced_road_under_canopy(), 1500, 70), (scenes::fenced_road_with_low_overhang(), 2000, 10)]
+    for (scene, behind_min) in
+        [(scenes::fenced_road_under_canopy(), 1500), (scenes::fenced_road_with_low_overhang(), 2000)]
     {
         let name = scene.name;
         let config = ScannerConfig::default();
@@ -454,7 +453,8 @@ fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
         };
         let (reached, behind) = (count(&is_drivable), count(&|class| class == FLAT_UNREACHABLE));
         println!("{name}: {reached} cells behind are drivable, {behind} are not");
-        assert!(reached <= reached_max && behind >= behind_min, "{name}: {reached} {behind}");
+        // A cell on the line of the fence may contain ground of both sides.
+        assert!(reached <= 10 && behind >= behind_min, "{name}: {reached} {behind}");
         // The paper's variant has no rule about passages.
         let open = terrain(&sweep, &TerrainConfig { variant: Variant::Paper, ..TerrainConfig::default() });
         assert!(!classes(&open).contains(&FLAT_UNREACHABLE));
