@@ -1,6 +1,6 @@
 //! Datagrams of sensors, live or of a capture -> a first configuration, with comments.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{self, BufReader};
@@ -24,6 +24,8 @@ use clearway_journal::counted::counted;
 
 /// Receive buffer of a socket, in bytes: that of a server.
 const RECEIVE_BUFFER_BYTES: usize = 4 << 20;
+/// Port of the receiver of telemetry, as sensors leave the factory.
+const TELEMETRY_PORT: u16 = 8308;
 /// Longest datagram that is read, in bytes; those of a Velodyne have 1206 and 512.
 const DATAGRAM_BYTES: usize = 2048;
 
@@ -41,6 +43,8 @@ pub struct FoundSensors {
     /// Where they were looked for, in words.
     pub place: String,
     sensors: Vec<FoundSensor>,
+    /// What else there was, for people.
+    left_out: Vec<String>,
 }
 
 /// Looks for senders of Velodyne data packets.
@@ -57,7 +61,7 @@ pub fn find_sensors(search: &SensorSearch) -> Result<FoundSensors> {
     if sensors.is_empty() {
         bail!("{place}: no data packet of a Velodyne: {}", received.other(matches!(search, SensorSearch::Capture(_))));
     }
-    Ok(FoundSensors { place, sensors })
+    Ok(FoundSensors { place, sensors, left_out: received.left_out() })
 }
 
 /// What is known of one sender of data packets.
@@ -73,10 +77,12 @@ struct PacketSender {
 struct ReceivedDatagrams {
     /// By address of the sender and port of the receiver.
     senders: BTreeMap<(IpAddr, u16), PacketSender>,
-    /// Port of the receiver of each sender's telemetry.
-    telemetry: BTreeMap<IpAddr, u16>,
+    /// Ports of the receiver of each address' telemetry.
+    telemetry: BTreeMap<IpAddr, BTreeSet<u16>>,
     /// Number of other datagrams, by length.
     others: BTreeMap<usize, u64>,
+    /// Packets of a capture that are no UDP datagrams, for people.
+    skipped: Vec<String>,
 }
 
 /// One sensor that was found.
@@ -109,7 +115,7 @@ impl ReceivedDatagrams {
                     Err(error) => *sender.refused.entry(error.to_string()).or_default() += 1,
                 }
             }
-            TELEMETRY_LENGTH => _ = self.telemetry.insert(from, port),
+            TELEMETRY_LENGTH => _ = self.telemetry.entry(from).or_default().insert(port),
             length => *self.others.entry(length).or_default() += 1,
         }
     }
@@ -118,7 +124,8 @@ impl ReceivedDatagrams {
     fn read(&mut self, file: &Path) -> Result<String> {
         let name = || file.display().to_string();
         let open = File::open(file).with_context(name)?;
-        for datagram in Capture::new(BufReader::new(open)).with_context(name)? {
+        let mut capture = Capture::new(BufReader::new(open)).with_context(name)?;
+        while let Some(datagram) = capture.next() {
             match datagram {
                 Ok(at) => self.push(at.source.ip(), at.destination_port, &at.payload, at.stamp_ns),
                 Err(error @ CaptureError::Truncated { .. }) => {
@@ -128,6 +135,7 @@ impl ReceivedDatagrams {
                 Err(error) => return Err(error).with_context(name),
             }
         }
+        self.skipped = capture.skipped().notes();
         Ok(name())
     }
 
@@ -193,7 +201,7 @@ impl ReceivedDatagrams {
                 name: if several { format!("lidar_{}", index + 1) } else { "top".into() },
                 address,
                 port,
-                telemetry_port: self.telemetry.get(&address).copied().unwrap_or(8308),
+                telemetry_port: self.telemetry_port(address, &found),
                 model,
                 rpm: status.rpm,
                 packets: sender.packets,
@@ -204,19 +212,32 @@ impl ReceivedDatagrams {
         found
     }
 
-    /// What else arrived, in words.
-    fn other(&self, is_capture: bool) -> String {
-        let mut received: Vec<String> = Vec::new();
+    /// Removes the least port to which telemetry of this address came. Sensors with the factory address send all data
+    /// packets to ports of their own, and the next port without telemetry stands for the telemetry that did not come.
+    fn telemetry_port(&mut self, address: IpAddr, taken: &[FoundSensor]) -> u16 {
+        let of_address = || taken.iter().filter(|sensor| sensor.address == address).map(|sensor| sensor.telemetry_port);
+        let seen = self.telemetry.get_mut(&address).and_then(BTreeSet::pop_first);
+        seen.unwrap_or_else(|| of_address().max().map_or(TELEMETRY_PORT, |port| port.wrapping_add(1)))
+    }
+
+    /// A line for each sender and each kind of datagram that belongs to no found sensor, for people.
+    fn left_out(&self) -> Vec<String> {
+        let mut lines: Vec<String> = Vec::new();
         for ((from, port), sender) in &self.senders {
             let why: Vec<_> = sender.refused.iter().map(|(reason, n)| format!("{n} refused: {reason}")).collect();
-            received.push(format!(
-                "{} from {from} to port {port} ({})",
-                counted(sender.packets, "data packet"),
-                why.join("; ")
-            ));
+            let packets = counted(sender.packets, "data packet");
+            lines.push(format!("{packets} from {from} to port {port} ({})", why.join("; ")));
         }
-        received.extend(self.telemetry.iter().map(|(from, port)| format!("telemetry from {from} to port {port}")));
-        received.extend(self.others.iter().map(|(length, n)| format!("{} of {length} bytes", counted(*n, "datagram"))));
+        let telemetry = self.telemetry.iter().flat_map(|(from, ports)| ports.iter().map(move |port| (from, port)));
+        lines.extend(telemetry.map(|(from, port)| format!("telemetry from {from} to port {port}")));
+        lines.extend(self.others.iter().map(|(length, n)| format!("{} of {length} bytes", counted(*n, "datagram"))));
+        lines.extend(self.skipped.iter().cloned());
+        lines
+    }
+
+    /// What there was instead of a sensor, in words.
+    fn other(&self, is_capture: bool) -> String {
+        let received = self.left_out();
         match (received.is_empty(), is_capture) {
             (true, true) => "it has no UDP datagrams".into(),
             (true, false) => "nothing arrived. Does `tcpdump -n udp port 2368` show packets? Does this host have an \
@@ -240,7 +261,7 @@ pub fn vehicle_name(text: &str) -> Result<String, String> {
 impl FoundSensors {
     /// The configuration with comments.
     pub fn configuration(&self, vehicle: &str) -> String {
-        let Self { place, sensors } = self;
+        let Self { place, sensors, .. } = self;
         let local = sensors.iter().all(|sensor| sensor.address.is_loopback());
         let host = if local { IpAddr::from(Ipv4Addr::LOCALHOST) } else { Ipv4Addr::UNSPECIFIED.into() };
         let (data, telemetry) = (sensors[0].port, sensors[0].telemetry_port);
@@ -307,7 +328,8 @@ impl FoundSensors {
             }
             Err(why) => format!("{}: the mount is not known: {why}; write it into the file", sensor.name),
         });
-        sensors.chain(mounts).collect()
+        let left_out = self.left_out.iter().map(|what| format!("not in the file: {what}"));
+        sensors.chain(mounts).chain(left_out).collect()
     }
 }
 

@@ -239,6 +239,8 @@ type StampedPackets = Vec<(i64, Vec<u8>)>;
 pub struct PacketGroups {
     datagrams: Peekable<Capture<'static>>,
     sensor: CaptureSensor,
+    /// Packets that are no UDP datagrams, for people; known at the end.
+    unread: Vec<String>,
 }
 
 impl PacketGroups {
@@ -249,12 +251,12 @@ impl PacketGroups {
     pub fn open(file: &Path) -> Result<Self> {
         let (opened, _) = files::open(file)?;
         let capture = Capture::new(BufReader::new(opened)).with_context(|| file.display().to_string())?;
-        Ok(Self { datagrams: capture.peekable(), sensor: CaptureSensor::default() })
+        Ok(Self { datagrams: capture.peekable(), sensor: CaptureSensor::default(), unread: Vec::new() })
     }
 
-    /// The datagrams of other sensors so far, for people.
+    /// The datagrams of other sensors and the unread packets so far, for people.
     pub fn notes(&self) -> Vec<String> {
-        self.sensor.notes()
+        self.sensor.notes().into_iter().chain(self.unread.clone()).collect()
     }
 }
 

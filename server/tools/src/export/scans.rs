@@ -26,8 +26,19 @@ pub struct DecodedScan<'a> {
     pub stamp_ns: i64,
     /// Position and orientation of the sensor in the ego frame.
     pub ego_from_sensor: &'a Isometry3<f64>,
-    /// Points in the sensor frame, in metres.
-    pub points: Vec<[f32; 3]>,
+    /// Its points.
+    pub points: ScanPoints,
+}
+
+/// The points of a scan, in the sensor frame.
+#[derive(Default)]
+pub struct ScanPoints {
+    /// Positions in metres.
+    pub at: Vec<[f32; 3]>,
+    /// Rank of each point's laser by elevation; empty if unknown.
+    pub ring: Vec<u16>,
+    /// Time of each point relative to the stamp of the scan, in nanoseconds; empty if unknown.
+    pub offset_ns: Vec<i32>,
 }
 
 /// The decoders of the sensors of a recording, by vehicle and index.
@@ -131,15 +142,24 @@ impl OneSensor {
     }
 }
 
-fn from_revolution(revolution: &Revolution) -> (i64, Vec<[f32; 3]>) {
-    (revolution.end_ns, revolution.points().map(|point| [point.x, point.y, point.z]).collect())
+fn from_revolution(revolution: &Revolution) -> (i64, ScanPoints) {
+    let mut points = ScanPoints::default();
+    for point in revolution.points() {
+        points.at.push([point.x, point.y, point.z]);
+        points.ring.push(point.ring);
+        points.offset_ns.push(point.time_ns.saturating_sub(revolution.end_ns) as i32);
+    }
+    (revolution.end_ns, points)
 }
 
 /// The stamp and the points of a recorded scan; `None` if its lists differ in length.
-fn from_scan(scan: &v1::Scan) -> Option<(i64, Vec<[f32; 3]>)> {
+fn from_scan(scan: &v1::Scan) -> Option<(i64, ScanPoints)> {
     let [x, y, z]: [Vec<f32>; 3] = [unpack(&scan.x)?, unpack(&scan.y)?, unpack(&scan.z)?];
-    let points = x.iter().zip(&y).zip(&z).map(|((&x, &y), &z)| [x, y, z]).collect();
-    (x.len() == y.len() && y.len() == z.len()).then_some((scan.stamp_ns, points))
+    let (ring, offset_ns): (Vec<u16>, Vec<i32>) = (unpack(&scan.ring)?, unpack(&scan.offset_ns)?);
+    let n = x.len();
+    let is_whole = [y.len(), z.len()] == [n; 2] && [ring.len(), offset_ns.len()].iter().all(|of| [0, n].contains(of));
+    let at = x.iter().zip(&y).zip(&z).map(|((&x, &y), &z)| [x, y, z]).collect();
+    is_whole.then_some((scan.stamp_ns, ScanPoints { at, ring, offset_ns }))
 }
 
 /// The configuration of a sensor that a client declared, as far as decoding needs it.

@@ -6,25 +6,29 @@
 //! (`visualization_msgs/msg/MarkerArray`) and `.../poses` (`geometry_msgs/msg/PoseArray`),
 //! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
 //! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording,
-//! and the stamp of the capture's or the scan's end.
+//! and the stamp of the capture's or the scan's end. With points the poses of ros2 are the recorded ones with their own
+//! stamps, so that a replay of the file has the poses of the drive; without points they are the poses of the maps.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use clearway_client::{Layer, MapView};
+use clearway_client::{Layer, MapView, v1};
+use clearway_daemon::encode::viewer::frame::isometry;
 use clearway_daemon::encode::viewer::raster::Rasters;
 use clearway_daemon::encode::viewer::{base_frame, foxglove as messages, ros, safe_paths};
+use clearway_mapping::event::EgoPose;
 use clearway_ros::published::{
     MARKER_ARRAY, OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, POSE_ARRAY, Published, TF_MESSAGE,
 };
 use foxglove::Encode;
 use foxglove::messages::FrameTransforms;
 use mcap::records::MessageHeader;
+use prost::Message as _;
 
-use super::scans::{DecodedScan, ScanDecoder};
+use super::scans::{DecodedScan, ScanDecoder, ScanPoints};
 use clearway_daemon::base::files;
 use clearway_journal::mcap_reader::{Header, Message};
 
@@ -46,6 +50,8 @@ pub struct ViewerFile {
     rasters: BTreeMap<String, Rasters>,
     /// Stamp of the newest map whose pose is written, by vehicle.
     placed: HashMap<String, i64>,
+    /// The vehicles of which the recorded poses are written.
+    with_poses: HashSet<String>,
     /// `None` before the first event.
     decoder: Option<ScanDecoder>,
     with_points: bool,
@@ -66,12 +72,13 @@ impl ViewerFile {
             channels: HashMap::new(),
             rasters: BTreeMap::new(),
             placed: HashMap::new(),
+            with_poses: HashSet::new(),
             decoder: None,
             with_points,
         })
     }
 
-    /// Writes the points of the scan that an event completes; `header` is that of the recording.
+    /// Writes the points of the scan that an event completes, or its pose; `header` is that of the recording.
     ///
     /// # Errors
     /// If the event or the header is wrong, or the file cannot be written.
@@ -85,7 +92,7 @@ impl ViewerFile {
             self.write_scan(vehicle, &scan, message.log_ns)?;
         }
         self.decoder = Some(decoder);
-        Ok(())
+        if self.dialect == Dialect::Ros2 { self.write_recorded_pose(vehicle, message) } else { Ok(()) }
     }
 
     /// Writes a layer of a map, and the vehicle's pose if the map is new.
@@ -140,11 +147,28 @@ impl ViewerFile {
             },
             Dialect::Ros2 => {
                 let (Some(tf), Some(odometry)) = (ros::tf(map), ros::odometry(map)) else { return Ok(()) };
-                self.write_ros("/tf", &TF_MESSAGE, &tf, log_ns)?;
-                let topic = format!("/clearway/{}/odometry", map.vehicle());
-                self.write_ros(&topic, &ODOMETRY, &odometry, log_ns)
+                if self.with_poses.contains(map.vehicle()) {
+                    Ok(())
+                } else {
+                    self.write_odometry(map.vehicle(), &tf, &odometry, log_ns)
+                }
             }
         }
+    }
+
+    /// Writes the pose of an event, if it is one.
+    fn write_recorded_pose(&mut self, vehicle: &str, message: &Message) -> Result<()> {
+        let event = v1::Event::decode(&*message.data).with_context(|| format!("journal of {vehicle}"))?;
+        let Some(v1::event::Body::EgoPose(pose)) = event.body else { return Ok(()) };
+        let Some(map_from_ego) = pose.map_from_ego.as_ref().map(isometry) else { return Ok(()) };
+        let pose = EgoPose { stamp_ns: pose.stamp_ns, map_from_ego, speed_mps: pose.speed_mps };
+        self.with_poses.insert(vehicle.to_owned());
+        self.write_odometry(vehicle, &ros::tf_of(vehicle, &pose), &ros::odometry_of(vehicle, &pose), message.log_ns)
+    }
+
+    fn write_odometry(&mut self, vehicle: &str, tf: &[u8], odometry: &[u8], log_ns: u64) -> Result<()> {
+        self.write_ros("/tf", &TF_MESSAGE, tf, log_ns)?;
+        self.write_ros(&format!("/clearway/{vehicle}/odometry"), &ODOMETRY, odometry, log_ns)
     }
 
     fn write_scan(&mut self, vehicle: &str, scan: &DecodedScan, log_ns: u64) -> Result<()> {
@@ -154,12 +178,13 @@ impl ViewerFile {
             Dialect::Foxglove => {
                 let mount = messages::transform(stamp_ns, &base, &frame, mount);
                 self.write_foxglove("/tf", &FrameTransforms { transforms: vec![mount] }, log_ns)?;
-                let cloud = messages::points(stamp_ns, &frame, scan.points.iter().copied());
+                let cloud = messages::points(stamp_ns, &frame, scan.points.at.iter().copied());
                 self.write_foxglove(&format!("/{vehicle}/points/{}", scan.sensor), &cloud, log_ns)
             }
             Dialect::Ros2 => {
                 self.write_ros("/tf", &TF_MESSAGE, &ros::transform(stamp_ns, &base, &frame, mount), log_ns)?;
-                let cloud = ros::points(stamp_ns, &frame, &scan.points);
+                let ScanPoints { at, ring, offset_ns } = &scan.points;
+                let cloud = ros::points(stamp_ns, &frame, at, ring, offset_ns);
                 let topic = format!("/clearway/{vehicle}/points/{}", scan.sensor);
                 self.write_ros(&topic, &POINT_CLOUD2, &cloud, log_ns)
             }

@@ -1,6 +1,6 @@
 //! Frames of the messages for viewers, and the pose of a map.
 
-use clearway_client::MapView;
+use clearway_client::{MapView, v1};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
 /// Name of the world frame of every vehicle.
@@ -13,7 +13,11 @@ pub fn base_frame(vehicle: &str) -> String {
 
 /// Ego pose at the end of the capture; `None` if no pose is known.
 pub fn map_from_ego(map: &MapView) -> Option<Isometry3<f64>> {
-    let pose = map.header().map_from_ego.as_ref()?;
+    map.header().map_from_ego.as_ref().map(isometry)
+}
+
+/// The rigid transform of a pose on the wire.
+pub fn isometry(pose: &v1::Pose) -> Isometry3<f64> {
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
-    Some(Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation))
+    Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation)
 }

@@ -2,6 +2,7 @@
 //! `geometry_msgs/msg/PoseArray` of safe points, `tf2_msgs/msg/TFMessage` and `nav_msgs/msg/Odometry`. A sensor's
 //! points -> `sensor_msgs/msg/PointCloud2`.
 
+use clearway_mapping::event::EgoPose;
 use clearway_proto::map::Layer;
 use clearway_ros::OccupancyGrid;
 use clearway_ros::cdr::Header;
@@ -49,16 +50,26 @@ pub fn safe_point_poses(map: &MapView, layer: &Layer) -> Vec<u8> {
 
 /// Pose of the ego frame in `map` as a tf message; `None` if no pose is known.
 pub fn tf(map: &MapView) -> Option<Vec<u8>> {
-    with_transform(map, |transform| tf_message_to_cdr(&[transform]))
+    pose_of(map).map(|pose| tf_of(map.vehicle(), &pose))
 }
 
 /// Pose of the ego frame in `map` and forward speed as odometry; `None` if no pose is known.
 pub fn odometry(map: &MapView) -> Option<Vec<u8>> {
-    let forward_mps = map.header().speed_mps.unwrap_or_default();
-    with_transform(map, |transform| {
-        let twist = Some(Twist { linear_mps: [forward_mps, 0.0, 0.0], angular_rps: [0.0; 3] });
-        Odometry { transform, twist }.to_cdr()
-    })
+    pose_of(map).map(|pose| odometry_of(map.vehicle(), &pose))
+}
+
+/// A vehicle's pose as a tf message.
+pub fn tf_of(vehicle: &str, pose: &EgoPose) -> Vec<u8> {
+    transform(pose.stamp_ns, MAP_FRAME, &base_frame(vehicle), &pose.map_from_ego)
+}
+
+/// A vehicle's pose and forward speed as odometry.
+pub fn odometry_of(vehicle: &str, pose: &EgoPose) -> Vec<u8> {
+    let header = Header { stamp_ns: pose.stamp_ns, frame_id: MAP_FRAME };
+    let child_frame_id = &base_frame(vehicle);
+    let transform = StampedTransform { header, child_frame_id, parent_from_child: pose.map_from_ego };
+    let twist = Some(Twist { linear_mps: [pose.speed_mps, 0.0, 0.0], angular_rps: [0.0; 3] });
+    Odometry { transform, twist }.to_cdr()
 }
 
 /// Transform of a frame in its parent as a tf message.
@@ -67,17 +78,31 @@ pub fn transform(stamp_ns: i64, parent: &str, child: &str, parent_from_child: &I
     tf_message_to_cdr(&[StampedTransform { header, child_frame_id: child, parent_from_child: *parent_from_child }])
 }
 
-/// Points in a frame, in metres, in one row.
-pub fn points(stamp_ns: i64, frame_id: &str, points: &[[f32; 3]]) -> Vec<u8> {
-    let data: Vec<u8> = points.iter().flatten().flat_map(|metres| metres.to_le_bytes()).collect();
-    let field = |(name, offset)| Field { name, offset, datatype: Datatype::Float32 as u8, count: 1 };
+/// Points in a frame, in metres, in one row, each with its ring and with its time in seconds after the stamp, if these
+/// lists are not empty.
+pub fn points(stamp_ns: i64, frame_id: &str, points: &[[f32; 3]], rings: &[u16], offsets_ns: &[i32]) -> Vec<u8> {
+    let mut fields = vec![("x", Datatype::Float32), ("y", Datatype::Float32), ("z", Datatype::Float32)];
+    fields.extend((!offsets_ns.is_empty()).then_some(("time", Datatype::Float32)));
+    fields.extend((!rings.is_empty()).then_some(("ring", Datatype::Uint16)));
+    let mut data = Vec::new();
+    for (index, point) in points.iter().enumerate() {
+        data.extend(point.iter().flat_map(|metres| metres.to_le_bytes()));
+        data.extend(offsets_ns.get(index).into_iter().flat_map(|ns| (*ns as f32 * 1e-9).to_le_bytes()));
+        data.extend(rings.get(index).into_iter().flat_map(|ring| ring.to_le_bytes()));
+    }
+    let mut point_step = 0;
+    let field = |(name, datatype): (&'static str, Datatype)| {
+        let offset = point_step;
+        point_step += datatype.size();
+        Field { name, offset, datatype: datatype as u8, count: 1 }
+    };
     PointCloud2 {
         header: Header { stamp_ns, frame_id },
         height: 1,
         width: points.len() as u32,
-        fields: [("x", 0), ("y", 4), ("z", 8)].map(field).to_vec(),
+        fields: fields.into_iter().map(field).collect(),
         big_endian: false,
-        point_step: 12,
+        point_step,
         row_step: data.len() as u32,
         data: &data,
         dense: true,
@@ -85,8 +110,9 @@ pub fn points(stamp_ns: i64, frame_id: &str, points: &[[f32; 3]]) -> Vec<u8> {
     .to_cdr()
 }
 
-fn with_transform(map: &MapView, write: impl FnOnce(StampedTransform) -> Vec<u8>) -> Option<Vec<u8>> {
-    let parent_from_child = map_from_ego(map)?;
-    let header = Header { stamp_ns: map.header().capture_end_ns, frame_id: MAP_FRAME };
-    Some(write(StampedTransform { header, child_frame_id: &base_frame(map.vehicle()), parent_from_child }))
+/// The pose of a map.
+fn pose_of(map: &MapView) -> Option<EgoPose> {
+    let header = map.header();
+    let speed_mps = header.speed_mps.unwrap_or_default();
+    Some(EgoPose { stamp_ns: header.capture_end_ns, map_from_ego: map_from_ego(map)?, speed_mps })
 }
