@@ -6,7 +6,10 @@ use std::path::Path;
 
 use bytes::{Buf, Bytes};
 use clearway_daemon::config::Config;
+use clearway_daemon::ingest::files::Readings;
+use clearway_daemon::ingest::files::mcap::McapOptions;
 use clearway_daemon::ingest::observation::{Limits, decode};
+use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::record::run_config;
 use clearway_journal::encode::{event_from_bytes, event_to_proto};
 use clearway_journal::reader::{RecordedMessage, RecordingReader};
@@ -52,6 +55,23 @@ pub fn recording(bytes: &[u8]) {
         }
     }
     assert!(recording.next().is_none() && recording.bytes_read() <= bytes.len() as u64);
+}
+
+/// The bytes of a ROS 2 bag in sqlite.
+pub fn bag(bytes: &[u8]) {
+    let folder = tempfile::tempdir().expect("a folder for the bag");
+    let file = folder.path().join("bag.db3");
+    std::fs::write(&file, bytes).expect("a bag");
+    let options = McapOptions { sensors_max: 1, ..McapOptions::default() };
+    let Ok(mut readings) = Readings::open(&[file], options) else { return };
+    let mut pipeline = pipeline();
+    for (sequence, reading) in (0..).zip(readings.by_ref().map_while(Result::ok)) {
+        let Reading { arrival_ns, source, body } = reading;
+        step(&mut pipeline, &Event { sequence, arrival_ns, source, body });
+    }
+    assert!(readings.next().is_none());
+    let left = std::fs::read_dir(folder.path()).expect("the folder of the bag").count();
+    assert_eq!(left, 1, "nothing is left beside the bag");
 }
 
 fn pipeline() -> Pipeline {

@@ -15,7 +15,10 @@ use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_mapping::event::{self as core, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
+use clearway_ros::cdr::{Header, Writer};
+use clearway_ros::pose::{StampedTransform, tf_message_to_cdr};
 use mcap::WriteOptions;
+use nalgebra::Isometry3;
 use prost::Message;
 use v1::observation::Body;
 
@@ -40,11 +43,14 @@ fn every_file_of_the_corpora_is_handled_without_a_panic() {
         RECORDINGS.iter().for_each(|(name, options)| write("recording", name, &mcap(options())));
         write("recording", "attachment_without_crc", &attachment_without_crc());
         write("recording", "record_beyond_its_chunk", &record_beyond_its_chunk());
+        write("bag", "drive", &sqlite_bag("PRAGMA page_size=512;"));
+        write("bag", "crashed", &sqlite_bag("PRAGMA page_size=512; PRAGMA journal_mode=WAL;"));
     }
     for (target, run, files_min) in [
         ("observation", entries::observation as fn(&[u8]), 12),
         ("event", entries::event, 3),
         ("recording", entries::recording, 4),
+        ("bag", entries::bag, 2),
     ] {
         let mut replayed = 0;
         for file in std::fs::read_dir(folder(target)).unwrap() {
@@ -143,6 +149,37 @@ fn mcap(options: WriteOptions) -> Vec<u8> {
     writer.finish().unwrap();
     drop(writer);
     bytes.into_inner()
+}
+
+/// The bytes of a small ROS 2 bag: a cloud without points, a mount, a pose, a topic that is not read.
+fn sqlite_bag(pragmas: &str) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bag.db3");
+    let transform = |parent, child| StampedTransform {
+        header: Header { stamp_ns: 1_700_000_000_000_000_000, frame_id: parent },
+        child_frame_id: child,
+        parent_from_child: Isometry3::translation(1.0, 0.0, 1.8),
+    };
+    let tf = |parent, child| tf_message_to_cdr(&[transform(parent, child)]);
+    let mut cloud = Writer::default();
+    cloud.header(&Header { stamp_ns: 1_700_000_000_000_000_000, frame_id: "top" }).u32(0).u32(0).u32(0);
+    cloud.bytes(&[0]).u32(0).u32(0).u32(0).bytes(&[1]);
+    let messages = [
+        (1, "/tf_static", "tf2_msgs/msg/TFMessage", tf("base_link", "top")),
+        (2, "/tf", "tf2_msgs/msg/TFMessage", tf("odom", "base_link")),
+        (3, "/points", "sensor_msgs/msg/PointCloud2", cloud.finish()),
+        (4, "/other", "std_msgs/msg/Empty", vec![0, 1, 0, 0]),
+    ];
+    let bag = rusqlite::Connection::open(&file).unwrap();
+    let tables = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+        CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);";
+    bag.execute_batch(&format!("{pragmas}{tables}")).unwrap();
+    for (id, topic, kind, bytes) in messages {
+        bag.execute("INSERT INTO topics VALUES (?1, ?2, ?3, 'cdr')", (id, topic, kind)).unwrap();
+        bag.execute("INSERT INTO messages VALUES (?1, ?1, 1700000000000000000 + ?1, ?2)", (id, bytes)).unwrap();
+    }
+    drop(bag);
+    std::fs::read(file).unwrap()
 }
 
 /// Offset of the first record of a kind outside of the chunks.

@@ -34,6 +34,11 @@ impl Frames {
         self.parents.iter().flat_map(|(child, (parent, _))| [child.as_str(), parent]).collect()
     }
 
+    /// True if a transform places this frame in a parent.
+    pub fn has_parent(&self, frame: &str) -> bool {
+        self.parents.contains_key(name(frame))
+    }
+
     /// Pose of frame `b` in frame `a`, which maps points of `b` to `a`; `None` if no chain of transforms joins them. It
     /// is the identity if both are the same frame.
     pub fn a_from_b(&self, a: &str, b: &str) -> Option<Isometry3<f64>> {

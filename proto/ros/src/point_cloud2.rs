@@ -2,7 +2,8 @@
 //!
 //! In: the bytes of a message. Out: header, layout and the bytes of the points, without a copy; [`crate::points`]
 //! decodes them. Layout: header; height, width; fields (name, offset, datatype, count); is_bigendian; point_step,
-//! row_step; data; is_dense. Drivers leave `row_step` 0 or too small: the rows then follow each other without a gap.
+//! row_step; data; is_dense. Drivers leave `row_step` 0 or write a
+//! wrong one: if it is too small, or if the data has no byte beside the points, the rows follow each other without a gap.
 
 use crate::cdr::{Header, MessageError, Reader, Writer, length};
 
@@ -138,7 +139,7 @@ impl<'a> PointCloud2<'a> {
     pub fn rows(&self) -> impl Iterator<Item = &'a [u8]> + use<'a> {
         let rows = if self.is_empty() { 0 } else { self.height as usize };
         let (width, point, data) = (self.width as usize, self.point_step as usize, self.data);
-        let row = width.saturating_mul(point).max(self.row_step as usize);
+        let row = self.row() as usize;
         (0..rows).flat_map(move |index| data[index * row..][..width * point].chunks_exact(point))
     }
 
@@ -154,6 +155,13 @@ impl<'a> PointCloud2<'a> {
         writer.finish()
     }
 
+    /// Bytes from one row to the next: `row_step`, unless the bytes of the points fill the data without it.
+    fn row(&self) -> u64 {
+        let points = u64::from(self.width).saturating_mul(u64::from(self.point_step));
+        let is_packed = u128::from(points) * u128::from(self.height) == self.data.len() as u128;
+        if is_packed { points } else { points.max(u64::from(self.row_step)) }
+    }
+
     fn check(&self) -> Result<(), MessageError> {
         if self.is_empty() {
             return Ok(());
@@ -162,9 +170,8 @@ impl<'a> PointCloud2<'a> {
             return Err(MessageError::value("point_step", 0, "at least 1 where there are points"));
         }
         let row = u64::from(self.width) * u64::from(self.point_step);
-        let needed = row.max(u64::from(self.row_step));
         // The last row may lack the padding of the other rows.
-        let needed = u128::from(needed) * u128::from(self.height - 1) + u128::from(row);
+        let needed = u128::from(self.row()) * u128::from(self.height - 1) + u128::from(row);
         if needed > self.data.len() as u128 {
             let found = format!("{} bytes for {} x {} points", self.data.len(), self.height, self.width);
             return Err(MessageError::value("data", found, "row_step a row"));

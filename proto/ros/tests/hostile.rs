@@ -278,13 +278,38 @@ proptest! {
     }
 }
 
+/// The head of a cloud for the fuzz target, and two points of zeros and ones.
+fn layout(fields: &[[u8; 4]], [height, point_step, flags]: [u8; 3]) -> Vec<u8> {
+    let mut bytes = vec![fields.len() as u8, height, point_step, flags];
+    bytes.extend(fields.as_flattened());
+    bytes.extend((0..8 * usize::from(point_step)).map(|at| [0, 0, 128, 63][at % 4]));
+    bytes
+}
+
 #[test]
-fn no_seed_of_the_corpus_causes_a_panic() {
-    let corpus: std::path::PathBuf = [env!("CARGO_MANIFEST_DIR"), "fuzz", "corpus", "message"].iter().collect();
+fn no_seed_of_the_corpora_causes_a_panic() {
+    let corpus = |target| [env!("CARGO_MANIFEST_DIR"), "fuzz", "corpus", target].iter().collect::<std::path::PathBuf>();
+    let xyz = [[0, 0, 7, 1], [1, 4, 7, 1], [2, 8, 7, 1]];
+    let wide = [[0, 0, 8, 1], [1, 8, 8, 1], [2, 16, 8, 1]];
+    let layouts = [
+        ("velodyne", layout(&[&xyz[..], &[[3, 12, 7, 1], [4, 16, 4, 1], [6, 18, 7, 1]]].concat(), [1, 22, 0])),
+        (
+            "ouster",
+            layout(&[&xyz[..], &[[3, 16, 7, 1], [5, 20, 6, 1], [9, 24, 4, 1], [4, 26, 2, 1]]].concat(), [2, 48, 1]),
+        ),
+        ("big_endian", layout(&[&xyz[..], &[[7, 12, 8, 1], [4, 20, 7, 1]]].concat(), [4, 24, 6])),
+        ("wide", layout(&[&wide[..], &[[10, 24, 10, 0], [7, 32, 9, 1]]].concat(), [1, 40, 0])),
+        ("beyond", layout(&[&xyz[..], &[[3, 255, 7, 1], [4, 2, 8, 9], [5, 12, 77, 1]]].concat(), [0, 13, 7])),
+    ];
     if std::env::var_os("CLEARWAY_BLESS").is_some() {
-        std::fs::create_dir_all(&corpus).unwrap();
-        NAMES.iter().for_each(|name| std::fs::write(corpus.join(name), golden(name)).unwrap());
+        ["message", "cloud"].iter().for_each(|target| std::fs::create_dir_all(corpus(target)).unwrap());
+        NAMES.iter().for_each(|name| std::fs::write(corpus("message").join(name), golden(name)).unwrap());
+        layouts.iter().for_each(|(name, bytes)| std::fs::write(corpus("cloud").join(name), bytes).unwrap());
     }
-    let seeds = std::fs::read_dir(corpus).unwrap().map(|seed| std::fs::read(seed.unwrap().path()).unwrap());
-    assert!(seeds.inspect(|seed| entries::message(seed)).count() >= NAMES.len());
+    for (target, run, seeds_min) in
+        [("message", entries::message as fn(&[u8]), NAMES.len()), ("cloud", entries::cloud, layouts.len())]
+    {
+        let seeds = std::fs::read_dir(corpus(target)).unwrap().map(|seed| std::fs::read(seed.unwrap().path()).unwrap());
+        assert!(seeds.inspect(|seed| run(seed)).count() >= seeds_min, "{target}");
+    }
 }

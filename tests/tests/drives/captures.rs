@@ -143,3 +143,37 @@ async fn gps_time_that_is_a_day_ahead_is_not_used() {
         assert!(is_used || late_ms < 1000, "{late_ms} ms");
     }
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_given_model_stands_for_an_unknown_model_byte_but_not_for_another_model() {
+    for (byte, model, is_read) in
+        [(0x23, None, false), (0x23, Some(Model::Vlp16), true), (0x28, Some(Model::Vlp16), false)]
+    {
+        let mut top = vlp16(1.8);
+        top.iter_mut().filter(|of| of.kind == Kind::Data).for_each(|datagram| datagram.payload[1205] = byte);
+        let (_folder, file) = capture(RAW_IP, &[], stamped(&top, FIRST, 2368));
+        let options = ReplayOptions { files: vec![file], model, extrinsics: Some(LEVEL_MOUNT), ..Default::default() };
+        let (summary, _) = replayed(options).await.unwrap();
+        assert_eq!(summary.maps() > 1, is_read, "{byte:#x} {model:?}: {:?}", summary.snapshot.refusals);
+    }
+}
+
+#[test]
+fn init_gives_sensors_with_one_address_ports_of_their_own() {
+    for with_telemetry in [false, true] {
+        let mut packets = Vec::new();
+        for (height_m, port) in [(1.8, 2368), (0.9, 2369)] {
+            let mut datagrams = vlp16(height_m);
+            datagrams.retain(|datagram| with_telemetry || datagram.kind == Kind::Data);
+            packets.extend(stamped(&datagrams, FIRST, port));
+        }
+        let (folder, _) = capture(RAW_IP, &[], packets);
+        let output = clearway_tests::run(folder.path(), "clearway", &["init", "--from", "a.pcap", "--out", "car.toml"]);
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(said.contains("next: clearway serve --config car.toml"), "{said}");
+        let written = std::fs::read_to_string(folder.path().join("car.toml")).unwrap();
+        for ports in ["lidar_1 = { data = 2368, telemetry = 8308 }", "lidar_2 = { data = 2369, telemetry = 8309 }"] {
+            assert!(written.contains(ports), "{written}");
+        }
+    }
+}

@@ -94,7 +94,7 @@ impl Sensor {
 
         // Identify.
         let Some(decoder) = &mut self.decoder else { return self.identify(packet, arrival_ns).map(|()| None) };
-        let mode = decoder.check(&packet)?;
+        let mode = decoder.check(&packet, self.config.model.is_some())?;
 
         // Reorder; decode and cut. Packets behind a cut wait for the next datagram, which may end another revolution.
         let in_order = self.order.push(packet, decoder.spec(), mode, arrival_ns)?;
@@ -151,13 +151,14 @@ impl Sensor {
         if let Some((telemetry, arrival_ns)) = &self.telemetry {
             decoder.apply_telemetry(telemetry, *arrival_ns);
         }
-        let newest = packet.map(|(packet, ns)| Ok((packet, decoder.check(&packet)?, ns))).transpose()?;
+        let is_given = self.config.model.is_some();
+        let newest = packet.map(|(packet, ns)| Ok((packet, decoder.check(&packet, is_given)?, ns))).transpose()?;
         let (mut order, mut unfit) = (Order::default(), 0);
         for (payload, arrival_ns) in &self.waiting {
             let packet = Packet::new(payload)?;
             let fits = identify::is_of_two(model)
                 && decoder
-                    .check(&packet)
+                    .check(&packet, is_given)
                     .is_ok_and(|mode| order.push(packet, decoder.spec(), mode, *arrival_ns).is_ok());
             unfit += u64::from(!fits);
         }

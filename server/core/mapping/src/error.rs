@@ -93,6 +93,12 @@ pub enum EventError {
         /// Greatest offset of the scan.
         offset_ns: i32,
     },
+    /// All points of a scan are farther from the sensor than any sensor measures.
+    #[error("{}", too_far(*nearest_m))]
+    ScanFar {
+        /// Distance of the nearest point, metres.
+        nearest_m: f64,
+    },
     /// A no-return direction of a scan is not a unit vector.
     #[error("scan with the no-return direction {direction:?}: a unit vector is allowed")]
     NoReturn {
@@ -128,7 +134,7 @@ pub enum EventError {
 
 impl EventError {
     /// The key under which a ledger counts the error: the decoder's own key (`length`, `block_flag`, and so on), or
-    /// `source`, `sensor`, `scan_lengths`, `scan_model`, `scan_offset`, `no_returns`, `stamp`, `stamp_range`, `pose`,
+    /// `source`, `sensor`, `scan_lengths`, `scan_model`, `scan_offset`, `scan_far`, `no_returns`, `stamp`, `stamp_range`, `pose`,
     /// or the key of a road error ([`RoadError::reason`]).
     pub fn reason(&self) -> &'static str {
         match self {
@@ -138,6 +144,7 @@ impl EventError {
             Self::ScanLengths { .. } | Self::ScanList { .. } => "scan_lengths",
             Self::ScanRing { .. } | Self::ScanElevation { .. } => "scan_model",
             Self::ScanOffset { .. } => "scan_offset",
+            Self::ScanFar { .. } => "scan_far",
             Self::NoReturn { .. } => "no_returns",
             Self::Stamp { .. } => "stamp",
             Self::StampRange { .. } => "stamp_range",
@@ -145,6 +152,15 @@ impl EventError {
             Self::Road(error) => error.reason(),
         }
     }
+}
+
+/// Text of the refusal of points that are all too far from the sensor.
+pub(crate) fn too_far(nearest_m: f64) -> String {
+    format!(
+        "the nearest point is {:.1} km from the origin of its frame: 1 km is allowed; the points are in a frame of a \
+         map or of the Earth: give the scan in the frame of its sensor, before a localisation moved it",
+        nearest_m * 1e-3
+    )
 }
 
 /// Checks that a stamp is in range.

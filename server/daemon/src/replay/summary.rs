@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clearway_lidar::SensorStatus;
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::map::ElevationSource;
 use clearway_mapping::sensor::mount::{MountError, MountEstimate};
@@ -151,6 +152,7 @@ impl ReplaySummary {
                 known["residual_m"] = estimate.residual_m.into();
                 known["inliers"] = estimate.inliers.into();
                 known["samples"] = estimate.samples.into();
+                known["weak"] = estimate.is_weak().into();
                 known
             }
             Mount::Unknown(why) => json!({ "source": "unknown", "reason": why.to_string() }),
@@ -208,7 +210,7 @@ fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
         if several && sensor.is_reference {
             lines.push("  reference sensor: its scans make the maps".to_owned());
         }
-        lines.extend(sensor.status.remarks().iter().map(|remark| format!("  {remark}")));
+        lines.extend(remarks(&sensor.status).iter().map(|remark| format!("  {remark}")));
         if let Some((source, advice)) = sensor.elevations.and_then(|of| Some((of.as_str(), of.advice()?))) {
             lines.push(format!("  elevations {source}: {advice}"));
         }
@@ -227,6 +229,13 @@ fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
 }
 
 /// The counts, sensors, maps and times of one vehicle.
+/// What is remarkable about a sensor, for people: one line each.
+fn remarks(status: &SensorStatus) -> Vec<String> {
+    let is_blind = status.revolutions > 0 && status.returns == 0;
+    let blind = is_blind.then(|| "its scans have no returns, so no map shows what is around it".to_owned());
+    status.remarks().into_iter().chain(blind).collect()
+}
+
 fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
     let Snapshot { ledger, sensors, .. } = snapshot;
     let sensors = sensors.iter().map(|sensor| {
@@ -235,7 +244,7 @@ fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
             "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
             "revolutions": sensor.status.revolutions,
             "elevations": sensor.elevations.map(ElevationSource::as_str),
-            "remarks": sensor.status.remarks(),
+            "remarks": remarks(&sensor.status),
         })
     });
     let document = json!({
@@ -259,7 +268,7 @@ pub fn describe(mount: &Mount) -> Option<String> {
     match mount {
         Mount::Estimated(estimate) => Some(format!(
             "estimated from the ground in {}: height {:.3} ± {:.3} m, pitch {:.2} ± {:.2} deg, roll {:.2} ± {:.2} deg \
-             ({} of {} lowest points on one plane, residual {:.3} m)",
+             ({} of {} lowest points on one plane, residual {:.3} m{})",
             counted(estimate.revolutions as u64, "revolution"),
             estimate.height_m,
             estimate.height_std_m,
@@ -270,6 +279,7 @@ pub fn describe(mount: &Mount) -> Option<String> {
             estimate.inliers,
             estimate.samples,
             estimate.residual_m,
+            if estimate.is_weak() { ", which is weak: give --extrinsics x,y,z,roll,pitch,yaw" } else { "" },
         )),
         Mount::Tf { ego_frame, frame_id } => Some(format!(
             "from tf, from {frame_id} to {ego_frame}; this assumes that the origin of {ego_frame} is on the ground; \

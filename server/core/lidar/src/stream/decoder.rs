@@ -113,8 +113,8 @@ impl Decoder {
     ///
     /// # Errors
     /// [`DatagramError::BlockFlag`] or [`DatagramError::Model`] if it is of another model.
-    pub fn check(&self, packet: &Packet<'_>) -> Result<ReturnMode, DatagramError> {
-        identify::check(packet, self.spec.model)
+    pub fn check(&self, packet: &Packet<'_>, is_model_given: bool) -> Result<ReturnMode, DatagramError> {
+        identify::check(packet, self.spec.model, is_model_given)
     }
 
     pub fn apply_telemetry(&mut self, telemetry: &Telemetry, arrival_ns: i64) {

@@ -43,7 +43,7 @@ pub(crate) fn find(packet: &Packet<'_>) -> Result<Finding, DatagramError> {
     } else {
         Model::Hdl64eS1
     };
-    check(packet, model).map(|_| Finding::Model(model))
+    check(packet, model, false).map(|_| Finding::Model(model))
 }
 
 /// True if the model is one of the two of [`Finding::Hdl32eOrVlp16`].
@@ -66,12 +66,13 @@ pub(crate) fn find_by_rate(before: &Packet<'_>, packet: &Packet<'_>) -> Option<M
     })
 }
 
-/// Checks that a packet has the flags and a model byte of `model`, and returns its return mode.
+/// Checks that a packet has the flags and a model byte of `model`, and returns its return mode. If the model `is_given`
+/// by the user, a byte of no model passes as well.
 ///
 /// # Errors
 /// - [`DatagramError::BlockFlag`] if a block has another flag.
 /// - [`DatagramError::Model`] if it has the byte of another model.
-pub(crate) fn check(packet: &Packet<'_>, model: Model) -> Result<ReturnMode, DatagramError> {
+pub(crate) fn check(packet: &Packet<'_>, model: Model, is_given: bool) -> Result<ReturnMode, DatagramError> {
     let spec = model.spec();
     let mode = match packet.return_mode() {
         _ if model == Model::Hdl64eS1 => ReturnMode::Strongest,
@@ -95,7 +96,8 @@ pub(crate) fn check(packet: &Packet<'_>, model: Model) -> Result<ReturnMode, Dat
         return Err(DatagramError::BlockFlag { block, flag, allowed });
     }
     let byte = packet.model_byte();
-    if !spec.model_bytes.is_empty() && !spec.model_bytes.contains(&byte) {
+    let is_unknown = || !Model::ALL.iter().any(|model| model.spec().model_bytes.contains(&byte));
+    if !spec.model_bytes.is_empty() && !spec.model_bytes.contains(&byte) && !(is_given && is_unknown()) {
         let allowed = spec.model_bytes.iter().map(|byte| u16::from(*byte)).collect();
         return Err(DatagramError::Model { byte, model: Some(model), allowed });
     }

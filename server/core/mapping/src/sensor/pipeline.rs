@@ -12,7 +12,7 @@ use clearway_lidar::{CalibrationSource, Model, Sensor, SensorStatus};
 
 use nalgebra::Vector3;
 
-use crate::error::{EventError, check_newer, check_stamp_range};
+use crate::error::{EventError, check_newer};
 use crate::event_time::EventTime;
 use crate::sensor::config::SensorConfig;
 use crate::sensor::distance_series::DistanceSeries;
@@ -29,10 +29,6 @@ use crate::sensor::self_filter::BodyConfig;
 use crate::sensor::self_filter::{RemovedPoints, SelfFilter};
 use crate::sensor::state::{Contribution, ElevationSource, SensorState};
 use crate::sensor::sweep::Mount;
-
-/// Squared length of a no-return direction. Ours: senders round to single precision or coarser, and an error of a
-/// thousandth is one of length alone, which no layer uses.
-const SQUARED_UNIT: std::ops::RangeInclusive<f32> = 0.998..=1.002;
 
 /// Number of scans from whose points the elevations are estimated. Ours: if the first scans do not show them, the later
 /// ones do not either, and each estimate takes as long as a layer.
@@ -255,7 +251,7 @@ impl SensorPipeline {
         now: EventTime,
         deadline_ns: i64,
     ) -> Result<RemovedPoints, EventError> {
-        check_scan(scan)?;
+        scan.check()?;
         if let (Some(model), ElevationSource::Model) = (self.model, self.scan_elevations) {
             model_check::check(scan, model)?;
         }
@@ -397,27 +393,6 @@ fn scan_state(name: &Arc<str>, scan: &Scan, elevations: ElevationSource, returns
         clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
         elevations: Some(elevations),
         ..SensorState::default()
-    }
-}
-
-fn check_scan(scan: &Scan) -> Result<(), EventError> {
-    let (x, y, z, intensity) = (scan.x.len(), scan.y.len(), scan.z.len(), scan.intensity.len());
-    if x != y || x != z || x != intensity {
-        return Err(EventError::ScanLengths { x, y, z, intensity });
-    }
-    for (list, length) in [("ring", scan.ring.len()), ("offset_ns", scan.offset_ns.len())] {
-        if length != 0 && length != x {
-            return Err(EventError::ScanList { list, length, points: x });
-        }
-    }
-    if let Some(&offset_ns) = scan.offset_ns.iter().max().filter(|offset_ns| **offset_ns > 0) {
-        return Err(EventError::ScanOffset { offset_ns });
-    }
-    // NaN is in no range.
-    let is_unit = |ray: &[f32; 3]| SQUARED_UNIT.contains(&ray.iter().map(|v| v * v).sum::<f32>());
-    match scan.no_returns.iter().find(|ray| !is_unit(ray)) {
-        Some(&direction) => Err(EventError::NoReturn { direction }),
-        None => check_stamp_range(scan.stamp_ns),
     }
 }
 

@@ -14,11 +14,9 @@ use nalgebra::Isometry3;
 use crate::sensor::deviation::Deviation;
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{ScanKnots, knots};
-use crate::sensor::observation::Scan;
+use crate::sensor::observation::{POSITION_M_MAX, Scan};
 use crate::sensor::self_filter::{FilterReason, RemovedPoints, SelfFilter};
 
-/// Greatest coordinate of a position, metres. Ours: no sensor of the family reaches half as far.
-const POSITION_M_MAX: f32 = 1000.0;
 /// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
 const CHUNK: usize = 1024;
 

@@ -9,6 +9,7 @@ use clearway_ros::pose::{Odometry, TfMessage, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2};
 
+use super::choice::is_ego;
 use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Duration of the start of a file from which its topics are known if tf places a sensor there, in ns. Ours: latched
@@ -24,7 +25,8 @@ pub struct AvailableTopics {
     pub(super) frames: Frames,
     /// The static transforms.
     pub(super) latched: Frames,
-    /// Faults of refused static transforms, by child frame; empty for messages that cannot be read at all.
+    /// Faults of refused transforms of frames that no other transform places, by child frame; empty for messages of
+    /// static transforms that cannot be read at all.
     refused_mounts: BTreeMap<String, String>,
 }
 
@@ -33,6 +35,8 @@ pub(super) struct Topic {
     pub kind: Kind,
     /// Frame of a sensor's points, or child frame of an odometry; of the first readable message.
     pub frame_id: Option<String>,
+    /// Stamps of the first clouds.
+    pub stamps: Stamps,
     /// Most points of a message.
     pub points: u64,
     /// Index of the topic in the order of their first messages.
@@ -69,7 +73,7 @@ impl AvailableTopics {
 
     fn insert(&mut self, topic: String, kind: Kind, bytes: &[u8]) {
         let (order, are_static) = (self.topics.len(), topic.ends_with("tf_static"));
-        let new = Topic { kind, frame_id: None, points: 0, order, refused: None };
+        let new = Topic { kind, frame_id: None, stamps: Stamps::default(), points: 0, order, refused: None };
         let found = self.topics.entry(topic).or_insert(new);
         let read = match kind {
             Kind::TfMessage => match tf_message(bytes) {
@@ -102,12 +106,13 @@ impl AvailableTopics {
             self.frames.insert(transform);
             if are_static {
                 self.latched.insert(transform);
-                self.refused_mounts.remove(name(transform.child_frame_id));
             }
+            self.refused_mounts.remove(name(transform.child_frame_id));
         }
-        for transform in message.refused.iter().filter(|_| are_static) {
+        for transform in &message.refused {
             let child = name(transform.child_frame_id);
-            if !self.latched.names().contains(child) {
+            // The vehicle's frame is placed by its poses, which state no mount.
+            if !self.frames.has_parent(child) && (are_static || !is_ego(child)) {
                 self.refused_mounts.insert(child.to_owned(), transform.fault.to_string());
             }
         }
@@ -122,11 +127,33 @@ impl AvailableTopics {
     }
 }
 
+/// The header stamps of the first clouds of a topic.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Stamps {
+    pub first_ns: Option<i64>,
+    count: u64,
+    differ: bool,
+}
+
+impl Stamps {
+    fn note(&mut self, stamp_ns: i64) {
+        self.count += 1;
+        self.differ |= *self.first_ns.get_or_insert(stamp_ns) != stamp_ns;
+    }
+
+    /// True if several clouds have one stamp.
+    pub fn stand_still(&self) -> bool {
+        self.count > 1 && !self.differ
+    }
+}
+
 impl Topic {
     /// The frame is known even if the points cannot be read.
     fn read_cloud(&mut self, bytes: &[u8]) -> Result<(), MessageError> {
+        let header = Reader::new(bytes)?.header()?;
+        self.stamps.note(header.stamp_ns);
         if self.frame_id.is_none() {
-            self.frame_id = Some(name(Reader::new(bytes)?.header()?.frame_id).to_owned());
+            self.frame_id = Some(name(header.frame_id).to_owned());
         }
         let cloud = PointCloud2::new(bytes)?;
         self.points = self.points.max(u64::from(cloud.width) * u64::from(cloud.height));

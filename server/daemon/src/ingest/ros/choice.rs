@@ -47,6 +47,10 @@ pub struct SensorTopic {
     pub topic: String,
     /// The frame of its messages.
     pub frame_id: String,
+    /// The frame of the tf tree that is taken for it: itself, or the only one with its name in another namespace.
+    pub placed_frame: String,
+    /// The stamp that all first clouds have: the stamps stand still, and the log times are used instead.
+    pub still_ns: Option<i64>,
     /// The sensor's pose on the vehicle, from tf; `None` if no chain of transforms gives it, or if its height is
     /// implausible.
     pub ego_from_sensor: Option<Isometry3<f64>>,
@@ -134,16 +138,37 @@ impl AvailableTopics {
     }
 
     fn sensor_topic(&self, topic: &str, ego_frame: &str) -> SensorTopic {
-        let frame_id = self.topics[topic].frame_id.clone().unwrap_or_default();
+        let found = &self.topics[topic];
+        let frame_id = found.frame_id.clone().unwrap_or_default();
+        let placed_frame = self.placed_frame(&frame_id).to_owned();
+        let still_ns = found.stamps.first_ns.filter(|_| found.stamps.stand_still());
         let is_merged = is_ego(&frame_id);
         let ego_from_sensor = if is_merged {
             Some(Translation3::new(0.0, 0.0, RAISED_M).into())
         } else {
-            let of_tf = self.frames.a_from_b(ego_frame, &frame_id);
+            let of_tf = self.frames.a_from_b(ego_frame, &placed_frame);
             of_tf.filter(|pose| HEIGHTS_M.contains(&pose.translation.z))
         };
         let refused_mount = self.refused_mount(&frame_id).filter(|_| ego_from_sensor.is_none());
-        SensorTopic { topic: topic.to_owned(), frame_id, ego_from_sensor, refused_mount, is_merged }
+        SensorTopic {
+            topic: topic.to_owned(),
+            frame_id,
+            placed_frame,
+            still_ns,
+            ego_from_sensor,
+            refused_mount,
+            is_merged,
+        }
+    }
+
+    /// The frame of the tf tree that stands for this frame: some drivers leave out the namespace of their vehicle.
+    fn placed_frame<'a>(&'a self, frame: &'a str) -> &'a str {
+        let names = self.frames.names();
+        let mut namesakes = names.iter().filter(|name| !frame.is_empty() && local_name(name) == local_name(frame));
+        match (names.contains(frame), namesakes.next(), namesakes.next()) {
+            (false, Some(only), None) => only,
+            _ => frame,
+        }
     }
 
     fn best_sensors(&self) -> Vec<&String> {
@@ -193,7 +218,8 @@ impl AvailableTopics {
         let mut notes = Vec::new();
         let mut used: BTreeSet<&str> = BTreeSet::new();
         for sensor in sensors {
-            let SensorTopic { topic, frame_id, ego_from_sensor, refused_mount, is_merged } = sensor;
+            let SensorTopic { topic, frame_id, placed_frame, still_ns, ego_from_sensor, refused_mount, is_merged } =
+                sensor;
             used.insert(topic);
             let found = &self.topics[topic];
             notes.push(match (ego_from_sensor, refused_mount, &found.refused) {
@@ -204,12 +230,18 @@ impl AvailableTopics {
                     "{topic} is used; its frame {frame_id} is the vehicle's, so another program has moved its points: \
                      rays are taken to begin {RAISED_M} m over the origin and are approximate"
                 ),
+                (Some(_), ..) if placed_frame != frame_id => {
+                    format!("{topic} is used; tf places {placed_frame}, which is taken for its frame {frame_id}")
+                }
                 (Some(_), ..) => format!("{topic} is used; tf places its frame {frame_id}"),
                 (None, Some(refused), _) => {
                     format!("{topic} is read; the transform that places its frame {frame_id} was refused: {refused}")
                 }
                 _ => format!("{topic} is used; tf does not place its frame {frame_id} 0.1 to 20 m over {ego_frame}"),
             });
+            notes.extend(still_ns.map(|ns| {
+                format!("{topic}: all stamps of its first messages are {ns} ns, so its log times are used as stamps")
+            }));
         }
         match pose {
             Some(PoseSource::Topic(topic)) => {
@@ -248,7 +280,10 @@ impl AvailableTopics {
                 format!("its frame {frame} is the vehicle's, so it was merged from other sensors; --topic uses it")
             }
             (kind, _) if kind.is_sensor() && is_fixed(frame) => {
-                format!("its frame {frame} does not move with the vehicle")
+                format!(
+                    "its frame {frame} does not move with the vehicle, so a localisation has moved its points: record \
+                     the driver's own cloud"
+                )
             }
             (kind, _) if kind.is_sensor() => match self.refused_mount(frame) {
                 Some(fault) => format!("the transform that places its frame {frame} was refused: {fault}"),
@@ -262,7 +297,7 @@ impl AvailableTopics {
     }
 }
 
-fn is_ego(frame: &str) -> bool {
+pub(super) fn is_ego(frame: &str) -> bool {
     EGO_FRAMES.contains(&local_name(frame))
 }
 
@@ -276,6 +311,11 @@ impl TopicChoice {
     pub fn decoder(&self) -> TopicDecoder {
         let sensors = self.sensors.iter().zip(0..).map(|(sensor, index)| (sensor.topic.clone(), index)).collect();
         let merged = self.sensors.iter().filter(|sensor| sensor.is_merged).map(|sensor| sensor.topic.clone());
-        TopicDecoder::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone()).lowering(merged.collect())
+        let still = self.sensors.iter().filter(|sensor| sensor.still_ns.is_some()).map(|sensor| sensor.topic.clone());
+        let frames = self.sensors.iter().map(|sensor| (sensor.topic.clone(), sensor.frame_id.clone()));
+        TopicDecoder::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone())
+            .lowering(merged.collect())
+            .stamping(still.collect())
+            .expecting(frames.collect())
     }
 }

@@ -12,6 +12,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use bytes::Bytes;
 use clearway_mapping::event::{Body, EgoPose, Scan, UNKNOWN_SOURCE};
+use clearway_ros::frames::name;
 use clearway_ros::pose::{Odometry, StampedTransform, TfMessage, Twist, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points, RefusedPart};
@@ -49,6 +50,14 @@ pub enum RosMessageError {
         /// The allowed types.
         allowed: &'static str,
     },
+    /// A cloud is in another frame than the first clouds of its topic.
+    #[error("frame {found}: allowed: {frame}, the frame of the topic's first cloud; record each sensor as a topic")]
+    OtherFrame {
+        /// The frame of the first clouds.
+        frame: String,
+        /// The frame of the message.
+        found: String,
+    },
     /// No chain of transforms joins the message's frame and the vehicle's.
     #[error("frame {frame}: no chain of transforms joins it to {ego_frame}")]
     Frame {
@@ -65,7 +74,7 @@ impl RosMessageError {
         match self {
             Self::Message(_) => "ros_message",
             Self::Kind { .. } => "ros_kind",
-            Self::Frame { .. } => "ros_frame",
+            Self::OtherFrame { .. } | Self::Frame { .. } => "ros_frame",
         }
     }
 }
@@ -84,19 +93,34 @@ pub struct TopicDecoder {
     steps_to_moving: usize,
     /// Topics of clouds in the vehicle's frame.
     lowered: BTreeSet<String>,
+    /// Topics of clouds whose stamps stand still.
+    still: BTreeSet<String>,
+    /// The frame of each topic's clouds, if it is known before.
+    cloud_frames: BTreeMap<String, String>,
 }
 
 impl TopicDecoder {
     /// A decoder of these topics; `frames` are the transforms that are known before the first message.
     pub fn new(sensors: BTreeMap<String, u16>, pose: Option<PoseSource>, ego_frame: &str, frames: Frames) -> Self {
-        let (ego_frame, lowered) = (ego_frame.to_owned(), BTreeSet::new());
-        Self { sensors, pose, ego_frame, frames, newest: None, steps_to_moving: usize::MAX, lowered }
+        let (lowered, still, cloud_frames) = Default::default();
+        let (ego_frame, steps_to_moving) = (ego_frame.to_owned(), usize::MAX);
+        Self { sensors, pose, ego_frame, frames, newest: None, steps_to_moving, lowered, still, cloud_frames }
     }
 
     /// The decoder, with the points of these topics, which are in the vehicle's frame, moved to the frame of a sensor
     /// over its origin.
     pub(super) fn lowering(self, lowered: BTreeSet<String>) -> Self {
         Self { lowered, ..self }
+    }
+
+    /// The decoder, with the arrivals of the clouds of these topics as their stamps.
+    pub(super) fn stamping(self, still: BTreeSet<String>) -> Self {
+        Self { still, ..self }
+    }
+
+    /// The decoder, which refuses clouds in other frames than these, by topic: they are of another sensor.
+    pub(super) fn expecting(self, cloud_frames: BTreeMap<String, String>) -> Self {
+        Self { cloud_frames, ..self }
     }
 
     /// True if messages of this topic and type are decoded.
@@ -138,8 +162,17 @@ impl TopicDecoder {
         } else if let Some(&source) = self.sensors.get(topic) {
             match kind {
                 Kind::PointCloud2 => {
-                    let mut points = Points::from_cloud(&PointCloud2::new(bytes)?)?;
+                    let cloud = PointCloud2::new(bytes)?;
+                    let found = name(cloud.header.frame_id);
+                    if let Some(frame) = self.cloud_frames.get(topic).filter(|frame| *frame != found) {
+                        let (frame, found) = (frame.clone(), found.to_owned());
+                        return Err(RosMessageError::OtherFrame { frame, found });
+                    }
+                    let mut points = Points::from_cloud(&cloud)?;
                     refused = std::mem::take(&mut points.refused);
+                    if self.still.contains(topic) {
+                        points.stamp_ns = arrival_ns;
+                    }
                     if self.lowered.contains(topic) {
                         points.z.iter_mut().for_each(|z| *z -= RAISED_M as f32);
                     }

@@ -22,7 +22,9 @@ mod plane;
 
 use nalgebra::{UnitQuaternion, Vector3};
 
+use crate::error::too_far;
 use crate::sensor::config::Extrinsics;
+use crate::sensor::observation::nearest_beyond_reach;
 use median::{weighted_median, weighted_std};
 use plane::{PlaneError, PlaneEstimate};
 
@@ -69,6 +71,12 @@ pub enum MountError {
         /// Number of revolutions that were read.
         revolutions: usize,
     },
+    /// All points are farther from the sensor than any sensor measures.
+    #[error("{}", too_far(*nearest_m))]
+    TooFar {
+        /// Distance of the nearest point, metres.
+        nearest_m: f64,
+    },
     /// No plane through the points can be the ground.
     #[error(
         "the best plane contains {inliers} of {samples} cells, in {sectors} of 12 directions; 100 a revolution in 4, \
@@ -84,7 +92,16 @@ pub enum MountError {
     },
 }
 
+/// Share of the cells that lie on the ground plane of an estimate that is not weak, percent. Ours: streets with walls
+/// and cars on both sides have about half.
+const INLIERS_PERCENT_MIN: usize = 20;
+
 impl MountEstimate {
+    /// True if few of the cells lie on the plane: it may be another surface than the ground.
+    pub fn is_weak(&self) -> bool {
+        100 * self.inliers < INLIERS_PERCENT_MIN * self.samples
+    }
+
     /// The extrinsics with x, y and yaw 0: the ego origin lies on the ground under the sensor.
     pub fn extrinsics(&self) -> Extrinsics {
         Extrinsics {
@@ -101,8 +118,9 @@ impl MountEstimate {
 /// Estimates the mount from the points of revolutions, sensor frame, metres. At most the first twenty are read.
 ///
 /// # Errors
-/// [`MountError::TooFewPoints`] if fewer than 100 cells a revolution have points; [`MountError::NoGround`] if no plane
-/// around the vehicle can be the ground in more than half of the revolutions.
+/// [`MountError::TooFewPoints`] if fewer than 100 cells a revolution have points; [`MountError::TooFar`] if all points of
+/// a revolution are farther than 1 km; [`MountError::NoGround`] if no plane around the vehicle can be the ground in more
+/// than half of the revolutions.
 pub fn estimate<I, P>(revolutions: I) -> Result<MountEstimate, MountError>
 where
     I: IntoIterator<Item = P>,
@@ -112,6 +130,9 @@ where
     let mut best = PlaneError { inliers: 0, samples: 0, sectors: 0 };
     for points in revolutions.into_iter().take(REVOLUTIONS_MAX) {
         read += 1;
+        if let Some(nearest_m) = nearest_beyond_reach(points.as_ref().iter().copied()) {
+            return Err(MountError::TooFar { nearest_m });
+        }
         match plane::estimate(points.as_ref()) {
             Ok(plane) => {
                 samples += plane.samples;
@@ -182,5 +203,22 @@ mod tests {
         assert_eq!(combined(vec![[5.0, 0.25]]), [5.0, 0.25]);
         let [_, std] = combined(vec![[0.0, 0.1], [1.0, 0.1], [2.0, 0.1]]);
         assert!(std > 1.4, "values that differ by more than they state are uncertain: {std}");
+    }
+
+    #[test]
+    fn an_estimate_from_few_of_many_cells_is_weak() {
+        let of = |inliers, samples| MountEstimate {
+            height_m: 1.8,
+            pitch_rad: 0.0,
+            roll_rad: 0.0,
+            height_std_m: 0.01,
+            pitch_std_rad: 0.01,
+            roll_std_rad: 0.01,
+            inliers,
+            samples,
+            residual_m: 0.085,
+            revolutions: 1,
+        };
+        assert!(of(110, 2245).is_weak() && !of(900, 2245).is_weak());
     }
 }
