@@ -44,7 +44,7 @@ async fn what_a_cloud_states_is_checked_before_it_counts() {
             "ECEF without a mount",
             drive_with(vec![], |_, ns| moved(ns, [4e6, 6e5, 4.8e6])),
             0,
-            "6277.0 km from the origin",
+            "6276.9 km from the origin",
         ),
         (
             "two sensors",
