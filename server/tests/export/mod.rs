@@ -375,10 +375,10 @@ fn a_ros_2_file_has_the_points_of_every_revolution_and_the_mount() {
     let bytes = revolutions[revolutions.len() - 1];
     assert_eq!(
         (&cloud["header"]["frame_id"], &cloud["width"], &cloud["data"]["length"]),
-        (&json!("alpha/top"), &json!(bytes / 12), &json!(bytes))
+        (&json!("alpha/top"), &json!(bytes / 12), &json!(bytes / 12 * 18))
     );
     let names: Vec<&Value> = cloud["fields"].as_array().unwrap().iter().map(|field| &field["name"]).collect();
-    assert_eq!(names, ["x", "y", "z"]);
+    assert_eq!(names, ["x", "y", "z", "time", "ring"]);
     // The events are newer than the maps, so the last transform is the sensor's mount.
     let transform = &topics["/tf"]["last"]["transforms"][0];
     assert_eq!(
