@@ -78,8 +78,7 @@ pub struct Obstacle {
     pub y_m: f64,
     /// Distance from the given point, in metres; 0 if the point lies in such a cell. No obstacle of the layer is
     /// nearer. The obstacle itself can be farther away by up to the size of the cell, because a map does not state
-    /// where in a cell it stands. The innermost cells of a radial grid start at the vehicle's origin, so an obstacle in
-    /// one is 0 m from there.
+    /// where in a cell it stands.
     pub distance_m: f64,
     /// Direction from the given point in radians, counter-clockwise from the ego x axis, -π to π.
     pub bearing_rad: f64,

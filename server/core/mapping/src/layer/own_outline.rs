@@ -1,22 +1,28 @@
 //! The cells in the vehicle's own outline are not occupied.
 //!
-//! In: a layer, and the outline, ego frame, metres. Out: the layer in which no cell whose centre lies in the outline is
-//! occupied: returns from there are those of the vehicle itself, its load or its passengers. Such a cell is unknown.
+//! In: a layer, and the outline, ego frame, metres. Out: the layer in which no square whose centre lies in the outline,
+//! and no radial cell that touches it, is occupied: returns from there are those of the vehicle itself, its load or its
+//! passengers, and a layer does not state where in a cell an obstacle stands. Such a cell is unknown.
+
+use std::f32::consts::TAU;
 
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::Meaning;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::Layer;
-use crate::layer::radial_grid::RadialGrid;
 use crate::vehicle_outline::Outline;
+
+/// Shares of a radial cell's depth and width at which it is compared with the outline. Ours: a cell near the vehicle is
+/// at most half a metre deep and a quarter of a metre wide.
+const SHARES: [f32; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
 
 /// Makes the occupied cells in the outline unknown.
 pub fn clear(layer: &mut Layer, outline: &Outline) {
     let mut class = TypedChannel::CLASS.reuse_values(&mut layer.channels);
     let legend = layer.legend;
-    let mut clear = |cell: usize| {
-        let is_occupied = |value: u8| legend.get(usize::from(value)).is_some_and(|of| of.meaning == Meaning::Occupied);
-        if let Some(value) = class.get_mut(cell).filter(|value| is_occupied(**value)) {
+    let is_occupied = |value: u8| legend.get(usize::from(value)).is_some_and(|of| of.meaning == Meaning::Occupied);
+    let mut clear = |cell: usize, is_own: &dyn Fn() -> bool| {
+        if let Some(value) = class.get_mut(cell).filter(|value| is_occupied(**value) && is_own()) {
             *value = 0;
         }
     };
@@ -29,11 +35,14 @@ pub fn clear(layer: &mut Layer, outline: &Outline) {
             for (row, (inner_m, outer_m)) in inner.zip(row_radius_m).enumerate().take_while(|(_, (m, _))| **m < reach_m)
             {
                 for column in 0..columns {
-                    let [cos, sin] = RadialGrid::direction(column, columns);
-                    let middle_m = (inner_m + outer_m) / 2.0;
-                    if outline.contains(centre_m[0] + middle_m * cos, centre_m[1] + middle_m * sin) {
-                        clear(row * columns + column);
-                    }
+                    let is_own = |across: f32, along: f32| {
+                        let (sin, cos) = libm::sincosf((column as f32 + across) / columns as f32 * TAU);
+                        let range_m = inner_m + along * (outer_m - inner_m);
+                        outline.contains(centre_m[0] + range_m * cos, centre_m[1] + range_m * sin)
+                    };
+                    clear(row * columns + column, &|| {
+                        SHARES.iter().any(|across| SHARES.iter().any(|along| is_own(*across, *along)))
+                    });
                 }
             }
         }
@@ -50,9 +59,8 @@ pub fn clear(layer: &mut Layer, outline: &Outline) {
                     let centre = |origin_m: f64, index: usize| origin_m + (index as f64 + 0.5) * cell_m;
                     let [x, y] = [centre(*origin_x_m, ix), centre(*origin_y_m, iy)];
                     // From the grid's axes to those of the vehicle.
-                    if outline.contains((cos * x + sin * y) as f32, (cos * y - sin * x) as f32) {
-                        clear(iy * width + ix);
-                    }
+                    let is_own = || outline.contains((cos * x + sin * y) as f32, (cos * y - sin * x) as f32);
+                    clear(iy * width + ix, &is_own);
                 }
             }
         }

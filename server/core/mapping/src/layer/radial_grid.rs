@@ -27,6 +27,13 @@ const RING_SPACING_M_MIN: f32 = 0.02;
 /// not free a cell that reaches far beyond it.
 const ROW_DEPTH_M: f32 = 1.0;
 
+/// Least depth of the first ring's row before the ring, metres. Ours: a degree of pitch moves a ring 4 m away by 0.2 m.
+const NEAR_EDGE_M_MIN: f32 = 0.25;
+
+/// Greatest depth of a row before the first ring, metres. Ours: an obstacle beside the vehicle must not mark the cells
+/// under it.
+const NEAR_ROW_DEPTH_M: f32 = 0.5;
+
 /// Grid of range and azimuth about a sensor.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RadialGrid {
@@ -43,6 +50,8 @@ pub struct RadialGrid {
     /// Largest number of row borders within one bucket.
     borders_a_bucket: usize,
     azimuths: AzimuthColumns,
+    /// Near edge of the first ring's row, metres; 0 if the rings are not known.
+    near_edge_m: f32,
     /// The lasers and the sensor height that the rows were computed from.
     made_from: Option<(Arc<Calibration>, f32)>,
 }
@@ -73,6 +82,7 @@ impl RadialGrid {
             first_bucket,
             borders_a_bucket,
             azimuths,
+            near_edge_m: 0.0,
             made_from: None,
         }
     }
@@ -99,12 +109,19 @@ impl RadialGrid {
         }
         let rings = ring_radii_m(calibration, height, range_m_max);
         *self = Self::new(sweep.mount_m, row_radii_m(&rings, range_m_max), columns);
+        self.near_edge_m = near_edge_m(&rings);
         self.made_from = Some((Arc::clone(calibration), height));
     }
 
     /// Number of rows.
     pub fn rows(&self) -> usize {
         self.row_radius_m.len()
+    }
+
+    /// Number of rows that begin within the blind zone: before a range, metres, or before the first ring.
+    pub(super) fn blind_rows(&self, blind_zone_m: f32) -> usize {
+        let begins_m = |row: &usize| self.row_span_m(*row).0;
+        (0..self.rows()).take_while(|row| begins_m(row) < blind_zone_m || begins_m(row) <= self.near_edge_m).count()
     }
 
     /// Number of columns.
@@ -235,16 +252,36 @@ pub fn ring_radii_m(calibration: &Calibration, height_m: f32, range_m_max: f32) 
     radii
 }
 
+/// Near edge of the first ring's row of a sweep, metres; 0 if the rings are not known.
+pub fn near_edge_of(sweep: &Sweep) -> f32 {
+    let rings_m = sweep.calibration.as_ref().map(|table| ring_radii_m(table, sweep.mount_height_m, f32::INFINITY));
+    rings_m.map_or(0.0, |rings_m| near_edge_m(&rings_m))
+}
+
+/// Near edge of the first ring's row, metres: half the distance to the second ring before the first, and at least
+/// [`NEAR_EDGE_M_MIN`]. 0 for fewer than two rings.
+pub fn near_edge_m(rings_m: &[f32]) -> f32 {
+    let [first_m, second_m, ..] = rings_m else { return 0.0 };
+    (first_m - NEAR_EDGE_M_MIN.max((second_m - first_m) / 2.0)).max(0.0)
+}
+
 /// Outer radius of each row, metres, ascending (`r_bench` of the UT Austin thesis, section IV.1). A radius lies midway
 /// between neighbouring rings, so that noise does not move a ring over a row border; the last is the largest range.
-/// Fewer than two rings separate nothing: then all rows have the same depth.
+/// Before the first ring, where the vehicle itself stands, rows of one depth follow the range. Fewer than two rings
+/// separate nothing: then all rows have the same depth.
 pub fn row_radii_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
     if rings_m.len() < 2 {
-        let rows = (range_m_max / ROW_DEPTH_M).ceil().max(1.0) as u16;
-        return (1..=rows).map(|row| range_m_max * f32::from(row) / f32::from(rows)).collect();
+        return equal_rows_m(range_m_max, ROW_DEPTH_M).collect();
     }
+    let before = equal_rows_m(near_edge_m(rings_m), NEAR_ROW_DEPTH_M);
     let midway = rings_m.windows(2).map(|pair| (pair[0] + pair[1]) / 2.0);
-    midway.chain([range_m_max]).collect()
+    before.chain(midway).chain([range_m_max]).collect()
+}
+
+/// Outer radii of as few rows of one depth, at most `depth_m`, as reach to a range, metres; none to 0.
+fn equal_rows_m(range_m: f32, depth_m: f32) -> impl Iterator<Item = f32> {
+    let rows = (range_m / depth_m).ceil() as u16;
+    (1..=rows).map(move |row| range_m * f32::from(row) / f32::from(rows))
 }
 
 #[cfg(test)]

@@ -151,7 +151,7 @@ fn the_rows_of_radial_maps_are_those_of_the_reference_sensor() {
     coarse.sensors[1].elevations_deg = vec![-10.0, -5.0];
     let rows = |pipeline: &mut Pipeline, event: &Event| {
         let map = step(pipeline, event)?;
-        Some((map.source, common::benches(&map.layers[0]).to_vec()))
+        Some((map.source, common::ring_benches(&map.layers[0]).to_vec()))
     };
     let mut alone = pipeline(&coarse);
     assert_eq!(rows(&mut alone, &scan(1, 10 * MS)), None);

@@ -80,7 +80,7 @@ fn rows_come_from_the_configured_elevations_or_from_the_rings_of_the_scan() {
         step(&mut pipeline, &event(0, MS, Body::Scan(scan))).unwrap()
     };
     let measured = map(Vec::new(), ground(false));
-    assert_eq!(common::benches(&measured.layers[0]).len(), 8);
+    assert_eq!(common::ring_benches(&measured.layers[0]).len(), 8);
     assert!(common::figure(&measured.layers[0], "drivable_share") > 0.95);
     assert_eq!(map(Vec::new(), ground(true)).layers, measured.layers, "the order of the points has no effect");
     let configured = map(elevations_deg, Scan { ring: Vec::new(), ..ground(false) });

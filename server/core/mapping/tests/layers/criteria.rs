@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, Seed};
+use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
 use clearway_mapping::layer::radial_grid::{ring_radii_m, row_radii_m};
@@ -48,8 +48,9 @@ fn map(config: &DrivabilityConfig, sweep: &Sweep) -> Layer {
     layer
 }
 
-fn class(layer: &Layer, row: usize, column: usize) -> u8 {
-    classes(layer)[row * size(layer).1 + column]
+/// Class of a cell by its ring, 0 the innermost, and its column.
+fn class(layer: &Layer, ring: usize, column: usize) -> u8 {
+    classes(layer)[(rows_before_rings(benches(layer)) + ring) * size(layer).1 + column]
 }
 
 #[test]
@@ -59,16 +60,20 @@ fn rows_follow_the_rings_and_end_at_60_m() {
     // -15 to -3 degrees meet the ground within 60 m; -1 degree meets it at 115 m.
     assert_eq!(rings.len(), 7);
     assert!((rings[0] - 2.0 / 15f32.to_radians().tan()).abs() < 0.05, "{rings:?}");
-    let radii = row_radii_m(&rings, 60.0);
+    let rows = row_radii_m(&rings, 60.0);
+    let (before, radii) = rows.split_at(rows_before_rings(&rows));
     assert_eq!(radii.len(), 7);
     assert_eq!(radii[6], 60.0);
+    // The first ring's row begins half a ring's distance before it; the rows before it are at most half a metre deep.
+    assert!((before.last().unwrap() - (3.0 * rings[0] - rings[1]) / 2.0).abs() < 1e-4, "{before:?}");
+    assert!(before[0] <= 0.5 && before.len() == 14, "{before:?}");
     for (radius, pair) in radii.iter().zip(rings.windows(2)) {
         assert!((radius - (pair[0] + pair[1]) / 2.0).abs() < 1e-6);
     }
 }
 
 #[test]
-fn no_sensor_has_more_rows_than_lasers_and_rows_ascend() {
+fn no_sensor_has_more_rows_of_rings_than_lasers_and_rows_ascend() {
     let models = [
         Model::Hdl64eS1,
         Model::Hdl64eS2,
@@ -83,7 +88,8 @@ fn no_sensor_has_more_rows_than_lasers_and_rows_ascend() {
         let calibration = Calibration::factory(model);
         for height in [0.3, 1.0, 1.73, 4.0] {
             let radii = row_radii_m(&ring_radii_m(&calibration, height, 60.0), 60.0);
-            assert!(radii.len() <= calibration.lasers.len(), "{model:?}");
+            let rings = radii.len() - rows_before_rings(&radii);
+            assert!(rings <= calibration.lasers.len(), "{model:?}");
             assert!(radii.is_sorted_by(|a, b| a < b), "{model:?} at {height} m: {radii:?}");
         }
     }
@@ -212,7 +218,8 @@ fn walled_bank(first_row: usize, opening: &Opening) -> (Sweep, f32) {
             0.0
         })
     });
-    let radii = row_radii_m(&ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0), 60.0);
+    let rows = row_radii_m(&ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0), 60.0);
+    let radii = &rows[rows_before_rings(&rows)..];
     let width_m = match opening {
         Opening::Columns(columns) => *columns as f32 * radii[first_row - 1] * 1f32.to_radians(),
         Opening::Rows(rows) => radii[first_row + 1 + rows] - radii[first_row + 1],
@@ -272,7 +279,7 @@ fn a_grade_is_climbed_across_empty_rows_in_every_direction() {
 #[test]
 fn a_ring_that_changes_its_row_is_one_piece_of_ground() {
     // The only returns: a ring in the last row where segments start, which goes on in the next row.
-    let last = benches(&map(&DrivabilityConfig::default(), &painted(|_, _, _, _| Some(0.0))))
+    let last = ring_benches(&map(&DrivabilityConfig::default(), &painted(|_, _, _, _| Some(0.0))))
         .iter()
         .position(|radius_m| *radius_m >= 7.0)
         .unwrap();
@@ -290,13 +297,18 @@ fn a_ring_that_changes_its_row_is_one_piece_of_ground() {
 }
 
 #[test]
-fn the_seed_of_the_thesis_needs_a_point_in_cell_0_0() {
-    let config = DrivabilityConfig { seed: Seed::FirstCell, ..DrivabilityConfig::default() };
-    let whole = painted(|_, _, _, _| Some(0.0));
-    assert_eq!(figure(&map(&config, &whole), "drivable_share"), 1.0);
-    let without = painted(|row, column, _, _| (row + column > 0).then_some(0.0));
-    assert_eq!(figure(&map(&config, &without), "drivable_share"), 0.0);
-    assert_eq!(figure(&map(&DrivabilityConfig::default(), &without), "drivable_share"), 1.0);
+fn the_thesis_whole_starts_in_the_vehicles_own_cell_whatever_returns_from_it() {
+    let config = DrivabilityConfig { variant: DrivabilityVariant::Paper, ..DrivabilityConfig::default() };
+    let mut sweep = painted(|_, _, _, _| Some(0.01));
+    assert_eq!(figure(&map(&config, &sweep), "drivable_share"), 1.0);
+    // The bonnet, the roof rack and the rear of the vehicle, and the first ring's place in column 0 alone.
+    for [x, y] in [[0.1, 0.001], [2.5, 0.3], [-1.5, -0.4]] {
+        add(&mut sweep, [x, y, 1.2]);
+    }
+    let own = map(&config, &sweep);
+    assert!(figure(&own, "drivable_share") > 0.999, "{}", figure(&own, "drivable_share"));
+    let memory = Sweep { remembered: sweep.x.len(), ..sweep };
+    assert_eq!(figure(&map(&config, &memory), "drivable_share"), 0.0, "the thesis has no memory");
 }
 
 #[test]
@@ -329,10 +341,9 @@ fn a_plane_is_found_through_sloping_ground() {
 fn a_blocked_sector_is_unknown_and_never_drivable() {
     let sweep = painted(|_, column, _, _| (!(30..60).contains(&column)).then_some(0.0));
     let layer = map(&DrivabilityConfig::default(), &sweep);
-    let (rows, _) = size(&layer);
-    for row in 0..rows {
+    for ring in 0..ring_benches(&layer).len() {
         for column in 30..60 {
-            assert_eq!(class(&layer, row, column), UNKNOWN);
+            assert_eq!(class(&layer, ring, column), UNKNOWN);
         }
     }
 }

@@ -4,6 +4,7 @@ mod contract;
 mod criteria;
 mod freespace;
 mod occupancy;
+mod own_outline;
 mod properties;
 mod safe_path;
 mod scenes;

@@ -7,9 +7,10 @@ use crate::layer::maker::Context;
 use crate::layer::radial_grid::RadialGrid;
 use crate::layer::radial_points::RadialPoints;
 use crate::sensor::sweep::Sweep;
+use crate::vehicle_outline::Outline;
 
 use super::class::UNIT_HEIGHT_UNKNOWN;
-use super::config::{BLIND_ZONE_M, DrivabilityConfig, UNIT_HEIGHT_M};
+use super::config::{BLIND_ZONE_M, DrivabilityConfig, DrivabilityVariant, UNIT_HEIGHT_M};
 
 /// Highest point of a cell so far: its height over the ground and its index in the sweep.
 #[derive(Clone, Copy, Debug)]
@@ -37,7 +38,10 @@ impl Heights {
         self.highest.clear();
         // One more row holds the points beyond the grid.
         self.highest.resize(grid.cells() + grid.columns(), EMPTY);
-        for (point, (cell, &height)) in points.cells().iter().zip(heights_m).enumerate() {
+        // The thesis has no memory.
+        let is_paper = config.variant == DrivabilityVariant::Paper;
+        let used = sweep.x.len() - if is_paper { sweep.remembered } else { 0 };
+        for (point, (cell, &height)) in points.cells().iter().zip(heights_m).take(used).enumerate() {
             if height <= config.overhang_m {
                 adjust_height(&mut self.highest[*cell as usize], height, point, sweep);
             }
@@ -60,19 +64,24 @@ impl Heights {
         }
     }
 
-    /// Makes the empty cells before the first return of each column level ground, as under the vehicle: the thesis
-    /// takes the vehicle's own cell as the start, and no return falls near it.
-    pub fn fill_blind_zone(&mut self, grid: &RadialGrid, config: &DrivabilityConfig) {
+    /// Makes the vehicle's own cells, and the empty cells before the first return of each column, level ground: the
+    /// thesis takes the vehicle's own cell as the start, and no return from the ground falls near it.
+    pub fn fill_blind_zone(&mut self, grid: &RadialGrid, outline: &Outline, config: &DrivabilityConfig) {
         let [x, y] = grid.centre_m();
         for column in 0..grid.columns() {
             let [cos, sin] = RadialGrid::direction(column, grid.columns());
-            let rows = (0..grid.rows()).take_while(|row| grid.row_span_m(*row).0 < BLIND_ZONE_M);
-            let empty =
-                rows.map(|row| (row, row * grid.columns() + column)).take_while(|(_, cell)| !self.is_seen(*cell));
-            for (row, cell) in empty.collect::<Vec<_>>() {
-                let radius_m = grid.row_span_m(row).1;
+            let at = |range_m: f32| [x + range_m * cos, y + range_m * sin];
+            for row in 0..grid.blind_rows(BLIND_ZONE_M) {
+                let cell = row * grid.columns() + column;
+                let (inner_m, outer_m) = grid.row_span_m(row);
+                let [middle_x, middle_y] = at((inner_m + outer_m) / 2.0);
+                let is_own = row == 0 || outline.contains(middle_x, middle_y);
+                if self.is_seen(cell) && !is_own {
+                    break;
+                }
+                let [far_x, far_y] = at(outer_m);
                 self.units[cell] = unit_height(0.0, config);
-                self.points[cell] = [x + radius_m * cos, y + radius_m * sin, 0.0];
+                self.points[cell] = [far_x, far_y, 0.0];
             }
         }
     }

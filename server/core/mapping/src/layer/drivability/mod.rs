@@ -25,6 +25,7 @@ use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::layer::radial_points::{RadialPoints, RadialSize};
+use crate::reach::config::ReachConfig;
 use crate::sensor::sweep::Sweep;
 
 use class::{DrivabilityClass, SEGMENT, UNIT_HEIGHT_UNKNOWN};
@@ -121,6 +122,7 @@ impl LayerMaker for Drivability {
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         // The thesis takes heights over the plane under the vehicle, and has no width of a vehicle.
+        let outline = context.reach.map_or_else(|| ReachConfig::default().outline(), |reach| reach.config().outline());
         let plane = Context { ground: None, radial: &[], reach: None, ..*context };
         let context = if self.config.variant == DrivabilityVariant::Paper { &plane } else { context };
         let points = context.radial_points(sweep, &mut self.points);
@@ -128,7 +130,7 @@ impl LayerMaker for Drivability {
         grid.write_geometry(&mut layer.geometry);
         self.heights.compute(points, sweep, context, &self.config);
         if self.config.variant == DrivabilityVariant::Paper {
-            self.heights.fill_blind_zone(grid, &self.config);
+            self.heights.fill_blind_zone(grid, &outline, &self.config);
         }
         self.segments.grow(grid, &self.heights, &self.config);
         let points = self.heights.points().iter().copied();

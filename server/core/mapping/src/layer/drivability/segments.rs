@@ -126,7 +126,7 @@ fn find_seeds(grid: &RadialGrid, units: &[i8], config: &DrivabilityConfig, seeds
     match config.seed {
         Seed::FirstCell => seeds.extend((0..units.len().min(1)).filter(known).map(|cell| cell as u32)),
         Seed::BlindZone => {
-            let rows = (0..grid.rows()).take_while(|row| grid.row_span_m(*row).0 < BLIND_ZONE_M).count();
+            let rows = grid.blind_rows(BLIND_ZONE_M);
             let innermost = |column| (0..rows).map(|row| row * grid.columns() + column).find(known);
             seeds.extend((0..grid.columns()).filter_map(innermost).filter(level).map(|cell| cell as u32));
         }

@@ -18,7 +18,7 @@ use crate::layer::drivability::class::DrivabilityClass;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer};
 use crate::layer::occupancy::class::OccupancyClass;
-use crate::layer::radial_grid::RadialGrid;
+use crate::layer::radial_grid::{RadialGrid, near_edge_of};
 use crate::reach::ReachCell;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
@@ -76,6 +76,8 @@ pub struct FreeSpace {
     returns: Vec<Returns>,
     /// Radial cell of each cell's centre; one past the last if the centre lies beyond the radial grid.
     radial_cell: Vec<u32>,
+    /// Range within which ground begins that the blind zone lies before, metres.
+    blind_zone_m: f32,
     /// The radial grid for which `radial_cell` was computed.
     made_for: Option<Geometry>,
 }
@@ -93,6 +95,7 @@ impl FreeSpace {
             grid: RadialGrid::default(),
             returns: Vec::new(),
             radial_cell: Vec::new(),
+            blind_zone_m: BLIND_ZONE_M,
             made_for: None,
         }
     }
@@ -126,6 +129,7 @@ impl FreeSpace {
         };
         if self.made_for.as_ref() != Some(&layer.geometry) {
             self.find_radial_cells(*centre_m, row_radius_m, *columns);
+            self.blind_zone_m = BLIND_ZONE_M.max(near_edge_of(sweep));
             self.made_for = Some(layer.geometry.clone());
         }
         self.of_radial_cell.clear();
@@ -140,7 +144,7 @@ impl FreeSpace {
         }));
         self.remove_own_returns(sweep, outline);
         let columns = usize::from(*columns);
-        mark_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, BLIND_ZONE_M);
+        mark_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, self.blind_zone_m);
         mark_holes(&mut self.of_radial_cell, row_radius_m, columns, HOLE_M_MAX);
         // State of the cells beyond the radial grid.
         self.of_radial_cell.push(State::Unknown);
