@@ -1,4 +1,5 @@
 //! Maps of recorded scans beside their labels.
 
 mod kitti;
+mod papers;
 mod several_recorded;

@@ -57,7 +57,7 @@ pub struct TerrainConfig {
     #[serde(skip)]
     pub roughness_points_min: u16,
     /// True if the layer has channels for the plane of each flat cell (height and slopes). `false` is ours, because the
-    /// channels cost bytes.
+    /// channels cost bytes. The variant `paper` always has them (Neuhaus 2009, figure 4).
     pub planes: bool,
 }
 
@@ -101,6 +101,11 @@ impl Variant {
 }
 
 impl TerrainConfig {
+    /// The parameters with the values of the variant.
+    pub(crate) fn of_variant(&self) -> Self {
+        Self { planes: self.planes || self.variant == Variant::Paper, ..self.clone() }
+    }
+
     /// Checks the values of the table `at`.
     ///
     /// # Errors

@@ -61,7 +61,7 @@ impl Terrain {
     /// A maker with validated parameters.
     pub fn new(config: &TerrainConfig) -> Self {
         Self {
-            config: config.clone(),
+            config: config.of_variant(),
             cells: Cells::new(config.range_m_max, config.cell_m, config.variant.division()),
             regions: Regions::default(),
             holes: Holes::default(),
@@ -222,9 +222,10 @@ impl LayerMaker for Terrain {
     }
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
-        // The paper takes heights over the plane under the vehicle.
+        // The paper takes heights over the plane under the vehicle, and has no memory.
         let is_ours = self.config.variant == Variant::Grounded;
-        let heights_m = if is_ours { context.heights_m(sweep) } else { &sweep.z };
+        let own = sweep.x.len() - sweep.remembered;
+        let heights_m = if is_ours { context.heights_m(sweep) } else { &sweep.z[..own] };
         self.cells.sort_points(sweep, heights_m, self.config.overhang_m);
         self.regions.divide(&self.cells, &self.config);
         self.seen.clear();

@@ -146,7 +146,8 @@ impl Cells {
     }
 
     /// Assigns the points to cells, and sums them. Points that are higher over the ground than `overhang_m`, and points
-    /// beyond the grid, are left out. `heights_m` are the heights of the points over the ground, metres.
+    /// beyond the grid, are left out. `heights_m` are the heights of the points over the ground, metres; points at the
+    /// end without a height are left out too.
     pub fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
         self.sum_cells(sweep, heights_m, overhang_m);
         self.number_slots();
@@ -178,7 +179,8 @@ impl Cells {
                     (*low, *high) = (if z < *low { z } else { *low }, if z > *high { z } else { *high });
                 }
             }
-            self.roughness.add_points(&cells, deviations.next().unwrap_or_default());
+            let deviations = deviations.next().unwrap_or_default();
+            self.roughness.add_points(&cells, &deviations[..deviations.len().min(heights_m.len())]);
         }
     }
 
