@@ -28,6 +28,10 @@ pub struct ReachConfig {
     /// Greatest height of an obstacle over the local ground, metres; the vehicle passes under higher ones. 2.5: UT
     /// Austin thesis, section IV.2.
     pub overhang_m: f32,
+    /// Range up to which ground that the sensors do not show is taken as free, metres: in the directions in which ground
+    /// was seen within this range, and nothing stands nearer. For a sensor that looks ahead only, whose first ring lies
+    /// far away. 0, never, is ours: unknown is never free.
+    pub assumed_ground_m: f32,
     /// Highest step of the ground that the vehicle drives over, metres. 0.3 is ours: a step between two cells, each
     /// with the noise of its returns, looks a little higher than it is.
     pub step_m_max: f32,
@@ -42,6 +46,7 @@ impl Default for ReachConfig {
             obstacle_m_min: 0.25,
             clearance_m: 0.15,
             overhang_m: 2.5,
+            assumed_ground_m: 0.0,
             step_m_max: 0.3,
         }
     }
@@ -60,6 +65,7 @@ impl ReachConfig {
             ("obstacle_m_min", self.obstacle_m_min, (0.05..=2.0, "0.05 to 2")),
             ("clearance_m", self.clearance_m, (0.05..=2.0, "0.05 to 2")),
             ("overhang_m", self.overhang_m, (0.5..=20.0, "0.5 to 20")),
+            ("assumed_ground_m", self.assumed_ground_m, (0.0..=30.0, "0 to 30")),
             ("step_m_max", self.step_m_max, (0.05..=2.0, "0.05 to 2")),
         ];
         check_each(at, values)?;

@@ -36,7 +36,7 @@ mod troughs;
 use std::ops::Range;
 
 use crate::ground::Ground;
-use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
+use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside, row_middles_m};
 use crate::ground::surface::Confidence;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
@@ -124,6 +124,7 @@ pub struct Reach {
     /// By cell: the polar cell of its centre.
     polar_of_cell: Vec<PolarIndex>,
     polar_runs: PolarRuns,
+    row_middles_m: [f32; ROWS],
     /// Indices of the cells under the vehicle.
     under_vehicle: Vec<usize>,
     obstacles: Obstacles,
@@ -170,6 +171,7 @@ impl Reach {
             config: config.clone(),
             polar_runs: PolarRuns::new(&polar_of_cell),
             polar_of_cell,
+            row_middles_m: row_middles_m(),
             under_vehicle: centres_m.filter(|(_, [x, y])| outline.contains(*x, *y)).map(|(cell, _)| cell).collect(),
             obstacles: Obstacles::new(),
             steps: Steps::new(),
@@ -365,6 +367,7 @@ impl Reach {
             }
         }
         self.classify_polar_cells(confidences);
+        self.assume_near_ground(confidences);
         let (runs, shadow, views) = (&self.polar_runs, &self.shadow, &self.views);
         let (hidden, gaps) = (&mut self.hidden, &mut self.hidden_gaps);
         self.open.fill_words(|cells| {
@@ -420,6 +423,22 @@ impl Reach {
                     Confidence::Seen | Confidence::Bridged => View::Clear,
                     Confidence::Extrapolated | Confidence::None => View::Closed,
                 };
+            }
+        }
+    }
+
+    /// Opens the ground before the first ground that was seen in each direction, if the configuration allows it so far.
+    fn assume_near_ground(&mut self, confidences: &[Confidence]) {
+        let rows = self.row_middles_m.iter().take_while(|range_m| **range_m <= self.config.assumed_ground_m).count();
+        for column in 0..COLUMNS {
+            let first = (0..rows).find(|row| {
+                let cell = row * COLUMNS + column;
+                self.has_obstacle[cell] || confidences[cell] == Confidence::Seen
+            });
+            let Some(seen) = first.filter(|row| !self.has_obstacle[row * COLUMNS + column]) else { continue };
+            for row in 0..seen {
+                let is_beside = self.is_beside_obstacle(row, column);
+                self.views[row * COLUMNS + column] = if is_beside { View::BesideObstacle } else { View::Clear };
             }
         }
     }

@@ -13,9 +13,13 @@ use proptest::prelude::*;
 use crate::common::*;
 
 fn freespace(sweep: &Sweep) -> Layer {
+    freespace_of(sweep, &ReachConfig::default())
+}
+
+fn freespace_of(sweep: &Sweep, reach: &ReachConfig) -> Layer {
     let mut maker = Freespace::new(&FreespaceConfig { height: true, why: true, ..FreespaceConfig::default() });
     let mut layer = maker.layer();
-    maker.make(sweep, &shared(sweep).context(), &mut layer);
+    maker.make(sweep, &shared_with(sweep, reach).context(), &mut layer);
     layer
 }
 
@@ -117,6 +121,37 @@ fn the_sector_of_a_covered_sensor_is_never_free() {
             assert!(!is_inside || range_m < 3.0, "{middle}: {x} {y}");
         }
     }
+}
+
+#[test]
+fn ground_before_the_first_ring_is_free_only_by_the_key_and_only_where_ground_was_seen_behind_it() {
+    // A sensor that looks 40 degrees to each side and sees nothing nearer than 10 m; a car stands ahead to the left, nearer
+    // than the first ring, and beyond 24 degrees to the right the view is covered.
+    let mut sweep = empty(Model::Hdl64eS2);
+    let whole =
+        cast(Model::Hdl64eS2, |x, y, z| z <= 0.0 || z <= 1.5 && (7.0..9.0).contains(&x) && (2.0..4.0).contains(&y));
+    for ((x, y), z) in whole.x.iter().zip(&whole.y).zip(&whole.z) {
+        let azimuth_deg = libm::atan2f(*y, *x).to_degrees();
+        let is_ahead = (-24.0..40.0).contains(&azimuth_deg);
+        if is_ahead && (libm::hypotf(*x, *y) > 10.0 || *z > 0.3) {
+            add(&mut sweep, [*x, *y, *z]);
+        }
+    }
+    let free = |assumed_ground_m: f32, x_m: [f32; 2], y_m: [f32; 2]| {
+        let layer = freespace_of(&sweep, &ReachConfig { assumed_ground_m, ..ReachConfig::default() });
+        count(&layer, FreespaceClass::Free, x_m, y_m)
+    };
+    assert_eq!(free(0.0, [-64.0, 64.0], [-64.0, 64.0]), 0, "unknown is never free");
+    assert_eq!(free(8.0, [-64.0, 64.0], [-64.0, 64.0]), 0, "the first ring is farther away");
+    assert_eq!(free(15.0, [4.0, 20.0], [-1.0, 1.0]), 64 * 8, "the road ahead");
+    assert_eq!(free(15.0, [7.0, 9.0], [2.0, 4.0]), 0, "the car");
+    assert_eq!(free(15.0, [9.5, 11.0], [3.0, 3.5]), 0, "behind the car");
+    assert_eq!(
+        free(15.0, [-64.0, 2.0], [-64.0, -2.0]) + free(15.0, [-64.0, -2.5], [-64.0, 64.0]),
+        0,
+        "beside and behind"
+    );
+    assert_eq!(free(15.0, [5.0, 10.0], [-9.0, -5.0]), 0, "the covered sector");
 }
 
 #[test]
