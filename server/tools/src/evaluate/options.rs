@@ -23,8 +23,8 @@ pub struct EvaluateOptions {
     pub labels: Option<PathBuf>,
     /// Position and orientation of the scans' sensor in the ego frame; as on KITTI's car if `None`.
     pub extrinsics: Option<Extrinsics>,
-    /// Model of the sensor. `None`: of scans, the rings in the file define the rows of radial maps, or an HDL-64E if
-    /// the file has no rings; of simulated scenes, an HDL-64E.
+    /// Model of the sensor. `None`: of scans, their rings or the order of their points define the rows of radial maps,
+    /// as in a replay, and else the rows are 1 m deep; of simulated scenes, an HDL-64E.
     pub model: Option<Model>,
     /// The variations of each labelled scan that are judged, in the order of the report.
     pub variations: Vec<Variation>,

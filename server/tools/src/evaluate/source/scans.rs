@@ -54,9 +54,7 @@ pub fn judge_folder(
     let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = extrinsics;
     let numbers = format!("{x_m},{y_m},{z_m},{roll_deg},{pitch_deg},{yaw_deg}");
     source.mounts.push(format!("{numbers} in {}: {origin}", folder.display()));
-    // Without rings the sensor is that of SemanticKITTI.
-    let has_rings = !read_scan(&pairs[0].scan, 0)?.ring.is_empty();
-    let model = options.model.or(Some(Model::Hdl64eS2).filter(|_| !has_rings));
+    let model = options.model;
     let mut truth = TruthMaker::new(maps, model, extrinsics)?;
     let mut pipelines: Vec<Option<(Pipeline, Mount)>> = options.variations.iter().map(|_| None).collect();
     for (index, pair) in (0..).zip(pairs) {
