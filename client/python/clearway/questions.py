@@ -67,8 +67,7 @@ class Obstacle(NamedTuple):
     y_m: float
     #: Distance from the given point, in metres; 0 if the point lies in such a cell. No obstacle of the layer is nearer.
     #: The obstacle itself can be farther away by up to the size of the cell, because a map does not state where in a
-    #: cell it stands. The innermost cells of a radial grid start at the vehicle's origin, so an obstacle in one is 0 m
-    #: from there.
+    #: cell it stands.
     distance_m: float
     #: Name of the cell's class.
     name: str
