@@ -13,11 +13,16 @@ pub const GROUND_S_MAX: f32 = 5.0;
 pub(super) const OBSTACLE_S_MAX: f32 = 0.3;
 
 /// Parameters of the memory of ground ([`crate::memory`]).
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MemoryConfig {
     /// True if ground that was seen in earlier maps is carried into the newest one. It needs ego poses; without them,
-    /// and in directions without a return, where the sensor may be covered, nothing is carried. `false` is ours: a few
-    /// returns in a covered sector are enough for ground to be carried into it.
+    /// and in directions without a return, where the sensor may be covered, nothing is carried. `true` is ours.
     pub enabled: bool,
+}
+
+impl Default for MemoryConfig {
+    fn default() -> Self {
+        Self { enabled: true }
+    }
 }

@@ -7,7 +7,9 @@
 //! - A cell remembers its lowest ground until a return shows it again, for `ground_s_max`.
 //! - An obstacle removes the ground of its cell. It is itself remembered for `obstacle_s_max`; then the cell is
 //!   unknown, so that a moving object leaves no trail, and ground under it is free only when it is seen again.
-//! - In a direction in which the newest map has no return nothing is remembered: the sensor may be covered there.
+//! - In a direction in which the newest map has no return nothing is remembered, for the sensor may be covered there;
+//!   nor is it far beyond the farthest return. A near return proves no more: from the vehicle's middle it may be seen in
+//!   another direction than from the sensor.
 //! - Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
 
 pub mod config;
@@ -32,6 +34,9 @@ const OBSTACLE_M: std::ops::RangeInclusive<f32> = 0.25..=2.5;
 const JUMP_M: [f64; 2] = [1.0, 60.0];
 const JUMP_RAD: [f64; 2] = [0.2, 3.0];
 const NS_PER_S: f64 = 1e9;
+/// Nothing is remembered beyond this many times the range of the farthest return of the newest map in that direction.
+/// Ours: the rings of 16 lasers on flat ground are at 7, 8, 11, 15, 21 and 38 m.
+const VIEW: f32 = 2.0;
 /// Number of directions in which the map may have no return.
 const DIRECTIONS: usize = AzimuthColumns::TWO_DEGREES as usize;
 
@@ -178,7 +183,7 @@ impl Memory {
     fn recall(&mut self, map_from_ego: &Isometry3<f64>) {
         let ego_from_map = map_from_ego.inverse();
         self.find_seen_cells(map_from_ego);
-        let in_view = self.directions_in_view(&ego_from_map, map_from_ego);
+        let view_m = self.view_m(&ego_from_map, map_from_ego);
         for &index in &self.listed {
             if self.seen[index as usize / 64] >> (index % 64) & 1 != 0 {
                 continue;
@@ -187,8 +192,9 @@ impl Memory {
             let [x, y] = cell.world.map(|world| (world as f64 + 0.5) * CELL_M);
             let z = if cell.obstacle_ns != 0 { cell.obstacle_m } else { cell.ground_m };
             let point = (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
-            let is_near = point.x * point.x + point.y * point.y <= RANGE_M_MAX * RANGE_M_MAX;
-            if is_near && in_view[self.azimuths.column(point.x, point.y) as usize] {
+            let range_m = libm::hypotf(point.x, point.y);
+            let in_view = VIEW * view_m[self.azimuths.column(point.x, point.y) as usize] >= range_m;
+            if range_m <= RANGE_M_MAX && in_view {
                 self.extended.push_remembered([point.x, point.y, point.z]);
             }
         }
@@ -209,12 +215,12 @@ impl Memory {
         }
     }
 
-    /// By direction of two degrees: true if the map has a point there, or in a direction beside it, within the range of
-    /// the memory. In other directions the sensor may be covered, so that nothing is known there now.
-    fn directions_in_view(&self, ego_from_map: &Isometry3<f64>, map_from_ego: &Isometry3<f64>) -> [bool; DIRECTIONS] {
+    /// By direction of two degrees: the range of the farthest point that the map has there, or in a direction beside it,
+    /// within the range of the memory, metres; 0 without a point.
+    fn view_m(&self, ego_from_map: &Isometry3<f64>, map_from_ego: &Isometry3<f64>) -> [f32; DIRECTIONS] {
         let middle = map_from_ego.translation.vector;
         let first = [middle.x, middle.y].map(|metres| (metres / CELL_M).floor() as i64 - SIDE / 2);
-        let mut in_view = [false; DIRECTIONS];
+        let mut view_m = [0f32; DIRECTIONS];
         for (word, bits) in self.seen.iter().enumerate() {
             let mut rest = *bits;
             while rest != 0 {
@@ -226,13 +232,13 @@ impl Memory {
                 let [x, y] = [x, y].map(|cell| (cell as f64 + 0.5) * CELL_M);
                 let point = (ego_from_map * Point3::new(x, y, middle.z)).cast::<f32>();
                 let direction = self.azimuths.column(point.x, point.y) as usize;
-                [DIRECTIONS - 1, 0, 1]
-                    .map(|beside| (direction + beside) % DIRECTIONS)
-                    .into_iter()
-                    .for_each(|at| in_view[at] = true);
+                for beside in [DIRECTIONS - 1, 0, 1] {
+                    let farthest_m = &mut view_m[(direction + beside) % DIRECTIONS];
+                    *farthest_m = farthest_m.max(libm::hypotf(point.x, point.y));
+                }
             }
         }
-        in_view
+        view_m
     }
 
     fn forget(&mut self) {
@@ -316,6 +322,19 @@ mod tests {
         let places = memory.extended.x.iter().zip(&memory.extended.y).skip(own);
         assert!(recalled >= 790, "{recalled}");
         assert!(places.into_iter().all(|(x, y)| *y < 0.1 * x.abs() + 0.3), "a sector that is covered stays unknown");
+    }
+
+    #[test]
+    fn near_returns_let_nothing_far_be_recalled() {
+        let mut memory = memory();
+        map(&mut memory, &points(0.0), 0.0);
+        let places = (0..720).map(|i| libm::sincosf(i as f32 * std::f32::consts::TAU / 720.0));
+        let (y, x): (Vec<f32>, Vec<f32>) = places.map(|(sin, cos)| (3.0 * sin, 3.0 * cos)).unzip();
+        let near = Sweep { z: vec![0.0; x.len()], x, y, ..Sweep::default() };
+        assert!(map(&mut memory, &near, 0.1) > 300);
+        let recalled = || memory.extended.x.iter().zip(&memory.extended.y).skip(near.x.len());
+        let farthest_m = recalled().map(|(x, y)| x.hypot(*y)).fold(0.0, f32::max);
+        assert!((5.0..=6.5).contains(&farthest_m), "{farthest_m}");
     }
 
     #[test]
