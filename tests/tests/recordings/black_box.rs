@@ -31,7 +31,7 @@ use clearway_sim::scenes::flat;
 use clearway_sim::vehicle::SimulatedVehicle;
 use tonic::transport::Channel;
 
-use crate::fixture::{Driving, config, readings, until, within};
+use crate::fixture::{Driving, config, readings, until, with_short_warm_up, within};
 
 async fn service(running: &Running) -> RecordingServiceClient<Channel> {
     let address = format!("http://{}", running.grpc.expect("gRPC is served"));
@@ -61,9 +61,9 @@ fn now_ms() -> u128 {
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn the_last_seconds_are_saved_when_the_maps_become_stale_and_on_request() {
     let folder = tempfile::tempdir().unwrap();
-    let mut config = config();
+    let mut config = with_short_warm_up(config());
     config.recorder.file = folder.path().join("car.mcap");
-    (config.recorder.warm_up_ms, config.recorder.save_on) = (500, vec![SaveRule::MapStale]);
+    config.recorder.save_on = vec![SaveRule::MapStale];
     // So that a busy test machine makes no map stale while the vehicle drives.
     config.vehicles[0].maps.valid_ms = 5000;
     let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
@@ -92,9 +92,9 @@ async fn the_last_seconds_are_saved_when_the_maps_become_stale_and_on_request() 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn the_last_seconds_are_saved_when_one_of_two_sensors_is_lost() {
     let folder = tempfile::tempdir().unwrap();
-    let mut config = config();
+    let mut config = with_short_warm_up(config());
     config.recorder.file = folder.path().join("car.mcap");
-    (config.recorder.warm_up_ms, config.recorder.save_on) = (500, vec![SaveRule::SensorLost]);
+    config.recorder.save_on = vec![SaveRule::SensorLost];
     let vehicle = &mut config.vehicles[0];
     let rear = SensorConfig { name: "rear".into(), ..vehicle.sensors[0].clone() };
     vehicle.sensors.push(rear);
@@ -189,7 +189,7 @@ impl Disk for FailingFile {
 
 #[test]
 fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_is_counted() {
-    let (config, disk) = (config(), FailingDisk::default());
+    let (config, disk) = (with_short_warm_up(config()), FailingDisk::default());
     let core = config.vehicles[0].core();
     let options = Recorder { warm_up_ms: 2000, ..Recorder::default() };
     let header = Header { vehicles: vec![("car".into(), vec![])], config: config.to_toml(), ..Header::default() };
@@ -245,7 +245,7 @@ fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_
 
 #[test]
 fn each_event_is_durable_within_flush_ms_if_a_sync_takes_no_more_than_half_of_it() {
-    let (config, disk) = (config(), FailingDisk::default());
+    let (config, disk) = (with_short_warm_up(config()), FailingDisk::default());
     let options = Recorder { flush_ms: 1000, ..Recorder::default() };
     let header = Header { vehicles: vec![("car".into(), vec![])], config: config.to_toml(), ..Header::default() };
     let began = Instant::now();
@@ -282,7 +282,7 @@ fn each_event_is_durable_within_flush_ms_if_a_sync_takes_no_more_than_half_of_it
 
 #[test]
 fn of_what_a_slow_disk_does_not_take_each_topic_counts_the_same_live_and_in_the_file() {
-    let (config, disk) = (config(), FailingDisk::default());
+    let (config, disk) = (with_short_warm_up(config()), FailingDisk::default());
     let core = config.vehicles[0].core();
     let options = Recorder { warm_up_ms: 500, queue: 100, ..Recorder::default() };
     let mut pipeline = Pipeline::new(&core, vec![None]).unwrap();

@@ -23,7 +23,7 @@ use tonic::Code;
 use tonic::transport::Channel;
 
 use crate::fixture::copied::copy;
-use crate::fixture::{self, config, feed, readings, until, within};
+use crate::fixture::{self, config, feed, readings, until, with_short_warm_up, within};
 
 /// Number of servers that are killed; 200 by `CLEARWAY_KILLS=200 cargo test --release --test system kill`.
 fn kills() -> usize {
@@ -35,9 +35,9 @@ const PACKET_TIME: Duration = Duration::from_nanos(1_327_104);
 
 /// A live server that records to `file` with a short warm-up.
 async fn live(file: &Path) -> Running {
-    let mut config = config();
+    let mut config = with_short_warm_up(config());
     config.recorder.file = file.to_owned();
-    (config.recorder.warm_up_ms, config.recorder.flush_ms) = (500, 50);
+    config.recorder.flush_ms = 50;
     Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts")
 }
 
@@ -179,9 +179,9 @@ async fn finished_parts_go_to_the_store_and_none_is_deleted_before_it_is_confirm
     let (recordings, away) = (folder.path().join("recordings"), folder.path().join("away"));
     // The store is away: its folder cannot be made while a file has the name of its parent.
     std::fs::write(&away, "").unwrap();
-    let mut config = config();
+    let mut config = with_short_warm_up(config());
     config.recorder.file = recordings.join("car.mcap");
-    (config.recorder.warm_up_ms, config.recorder.keep_mb) = (500, 1);
+    config.recorder.keep_mb = 1;
     config.store.url = away.join("store").display().to_string();
     let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
     let (mut service, status) = (service(&running).await, running.vehicles.0[0].status.clone());
@@ -211,9 +211,9 @@ async fn finished_parts_go_to_the_store_and_none_is_deleted_before_it_is_confirm
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_is_split_saved_stopped_and_listed_over_zenoh() {
     let folder = tempfile::tempdir().unwrap();
-    let mut config = config();
+    let mut config = with_short_warm_up(config());
     config.recorder.file = folder.path().join("car.mcap");
-    (config.recorder.warm_up_ms, config.zenoh.enabled) = (500, true);
+    config.zenoh.enabled = true;
     let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
     let settings = format!("{{ mode: \"client\", connect: {{ endpoints: [{:?}] }} }}", running.zenoh[0]);
     let session = zenoh::open(zenoh::Config::from_json5(&settings).unwrap()).await.expect("a session");
@@ -259,9 +259,9 @@ async fn digests_in_place_of_maps_prove_the_same_and_events_alone_make_the_maps_
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     for maps in [RecordedMaps::Full, RecordedMaps::Digest, RecordedMaps::None] {
-        let mut config = config();
+        let mut config = with_short_warm_up(config());
         config.recorder.file = at(&format!("{}.mcap", maps.as_str()));
-        (config.recorder.maps, config.recorder.warm_up_ms) = (maps, 500);
+        config.recorder.maps = maps;
         // The same boot id, because it is in each map.
         let setup = Setup { config, boot_id: Some(7), ..Setup::default() };
         let running = Server::start(setup).await.expect("the server starts");

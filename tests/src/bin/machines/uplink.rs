@@ -116,6 +116,8 @@ impl Bed {
         if !recording.is_empty() {
             config.recorder.file = self.recording().join("car.mcap");
             (config.recorder.part_s, config.recorder.save_s, config.recorder.warm_up_ms) = (2, 1, 500);
+            // It keeps ground for longer than this warm-up.
+            config.vehicles[0].maps.memory.enabled = false;
             (config.store.url, config.store.delete) = (STORE.into(), true);
             config.store.upload_kbit_s_max = UPLOAD_KBIT_S;
         }
