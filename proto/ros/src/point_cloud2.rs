@@ -2,8 +2,8 @@
 //!
 //! In: the bytes of a message. Out: header, layout and the bytes of the points, without a copy; [`crate::points`]
 //! decodes them. Layout: header; height, width; fields (name, offset, datatype, count); is_bigendian; point_step,
-//! row_step; data; is_dense. Drivers leave `row_step` 0 or write a
-//! wrong one: if it is too small, or if the data has no byte beside the points, the rows follow each other without a gap.
+//! row_step; data; is_dense. Drivers leave `row_step` 0 or write a wrong one: if it is too small, or if the data has no
+//! byte beside the points, the rows follow each other without a gap.
 
 use crate::cdr::{Header, MessageError, Reader, Writer, length};
 

@@ -51,8 +51,8 @@ pub struct EvaluateArguments {
     /// Position and orientation of the sensor in the ego frame, in metres and degrees; as on KITTI's car if absent.
     #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     extrinsics: Option<Extrinsics>,
-    /// Model of the sensor. If absent: of scans, their rings or the order of their points define the rows of radial maps,
-    /// as in a replay, and else the rows are 1 m deep; of simulated scenes, an HDL-64E.
+    /// Model of the sensor. If absent: of scans, their rings or the order of their points define the rows of radial
+    /// maps, as in a replay, and else the rows are 1 m deep; of simulated scenes, an HDL-64E.
     #[arg(long, value_name = "MODEL")]
     model: Option<Model>,
     /// Judge each labelled scan in these variations, or all: recorded, bend+3 (the world rises by 3 percent from 8 m

@@ -134,8 +134,8 @@ pub enum EventError {
 
 impl EventError {
     /// The key under which a ledger counts the error: the decoder's own key (`length`, `block_flag`, and so on), or
-    /// `source`, `sensor`, `scan_lengths`, `scan_model`, `scan_offset`, `scan_far`, `no_returns`, `stamp`, `stamp_range`, `pose`,
-    /// or the key of a road error ([`RoadError::reason`]).
+    /// `source`, `sensor`, `scan_lengths`, `scan_model`, `scan_offset`, `scan_far`, `no_returns`, `stamp`,
+    /// `stamp_range`, `pose`, or the key of a road error ([`RoadError::reason`]).
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Datagram(refusal) => refusal.reason(),

@@ -1,7 +1,6 @@
 //! Files, by the endings of their names -> observations and the stamps at which they are sent.
 
 use std::io::BufReader;
-use std::iter::Peekable;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -237,10 +236,10 @@ type StampedPackets = Vec<(i64, Vec<u8>)>;
 /// The datagrams of one sensor of a capture, in groups that make one observation each: an iterator. A capture that is
 /// cut off gives the groups before the cut.
 pub struct PacketGroups {
-    datagrams: Peekable<Capture<'static>>,
+    capture: Capture<'static>,
+    /// The datagram that begins the next group.
+    pending: Option<Result<Datagram, CaptureError>>,
     sensor: CaptureSensor,
-    /// Packets that are no UDP datagrams, for people; known at the end.
-    unread: Vec<String>,
 }
 
 impl PacketGroups {
@@ -251,12 +250,12 @@ impl PacketGroups {
     pub fn open(file: &Path) -> Result<Self> {
         let (opened, _) = files::open(file)?;
         let capture = Capture::new(BufReader::new(opened)).with_context(|| file.display().to_string())?;
-        Ok(Self { datagrams: capture.peekable(), sensor: CaptureSensor::default(), unread: Vec::new() })
+        Ok(Self { capture, pending: None, sensor: CaptureSensor::default() })
     }
 
-    /// The datagrams of other sensors and the unread packets so far, for people.
+    /// The datagrams of other sensors, and the packets that are no UDP datagrams, so far; for people.
     pub fn notes(&self) -> Vec<String> {
-        self.sensor.notes().into_iter().chain(self.unread.clone()).collect()
+        self.sensor.notes().into_iter().chain(self.capture.skipped().notes()).collect()
     }
 }
 
@@ -269,9 +268,14 @@ impl Iterator for PacketGroups {
             let first_ns = packets.first().map(|(stamp_ns, _)| *stamp_ns);
             let near =
                 |stamp_ns: i64| first_ns.is_none_or(|first| (0..=PACKETS_NS).contains(&stamp_ns.saturating_sub(first)));
-            let is_next =
-                |next: &Result<Datagram, _>| packets.is_empty() || next.as_ref().is_ok_and(|d| near(d.stamp_ns));
-            match self.datagrams.next_if(is_next) {
+            let is_next = |next: &Result<Datagram, CaptureError>| {
+                packets.is_empty() || next.as_ref().is_ok_and(|d| near(d.stamp_ns))
+            };
+            match self.pending.take().or_else(|| self.capture.next()) {
+                Some(next) if !is_next(&next) => {
+                    self.pending = Some(next);
+                    break;
+                }
                 Some(Ok(datagram)) if self.sensor.has_sent(&datagram) => {
                     packets.push((datagram.stamp_ns, datagram.payload));
                 }

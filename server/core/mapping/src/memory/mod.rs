@@ -8,8 +8,8 @@
 //! - An obstacle removes the ground of its cell. It is itself remembered for `obstacle_s_max`; then the cell is
 //!   unknown, so that a moving object leaves no trail, and ground under it is free only when it is seen again.
 //! - In a direction in which the newest map has no return nothing is remembered, for the sensor may be covered there;
-//!   nor is it far beyond the farthest return. A near return proves no more: from the vehicle's middle it may be seen in
-//!   another direction than from the sensor.
+//!   nor is it far beyond the farthest return. A near return proves no more: from the vehicle's middle it may be seen
+//! in   another direction than from the sensor.
 //! - Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
 
 pub mod config;
@@ -215,8 +215,8 @@ impl Memory {
         }
     }
 
-    /// By direction of two degrees: the range of the farthest point that the map has there, or in a direction beside it,
-    /// within the range of the memory, metres; 0 without a point.
+    /// By direction of two degrees: the range of the farthest point that the map has there, or in a direction beside
+    /// it, within the range of the memory, metres; 0 without a point.
     fn view_m(&self, ego_from_map: &Isometry3<f64>, map_from_ego: &Isometry3<f64>) -> [f32; DIRECTIONS] {
         let middle = map_from_ego.translation.vector;
         let first = [middle.x, middle.y].map(|metres| (metres / CELL_M).floor() as i64 - SIDE / 2);

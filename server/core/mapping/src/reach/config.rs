@@ -28,9 +28,9 @@ pub struct ReachConfig {
     /// Greatest height of an obstacle over the local ground, metres; the vehicle passes under higher ones. 2.5: UT
     /// Austin thesis, section IV.2.
     pub overhang_m: f32,
-    /// Range up to which ground that the sensors do not show is taken as free, metres: in the directions in which ground
-    /// was seen within this range, and nothing stands nearer. For a sensor that looks ahead only, whose first ring lies
-    /// far away. 0, never, is ours: unknown is never free.
+    /// Range up to which ground that the sensors do not show is taken as free, metres: in the directions in which
+    /// ground was seen within this range, and nothing stands nearer. For a sensor that looks ahead only, whose first
+    /// ring lies far away. 0, never, is ours: unknown is never free.
     pub assumed_ground_m: f32,
     /// Highest step of the ground that the vehicle drives over, metres. 0.3 is ours: a step between two cells, each
     /// with the noise of its returns, looks a little higher than it is.

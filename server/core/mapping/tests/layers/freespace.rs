@@ -125,8 +125,8 @@ fn the_sector_of_a_covered_sensor_is_never_free() {
 
 #[test]
 fn ground_before_the_first_ring_is_free_only_by_the_key_and_only_where_ground_was_seen_behind_it() {
-    // A sensor that looks 40 degrees to each side and sees nothing nearer than 10 m; a car stands ahead to the left, nearer
-    // than the first ring, and beyond 24 degrees to the right the view is covered.
+    // A sensor that looks 40 degrees to each side and sees nothing nearer than 10 m; a car stands ahead to the left,
+    // nearer than the first ring, and beyond 24 degrees to the right the view is covered.
     let mut sweep = empty(Model::Hdl64eS2);
     let whole =
         cast(Model::Hdl64eS2, |x, y, z| z <= 0.0 || z <= 1.5 && (7.0..9.0).contains(&x) && (2.0..4.0).contains(&y));

@@ -25,8 +25,8 @@ pub(super) const HITS_SLOW: u8 = 20;
 /// Number of returns at high speed, and if the speed is not known. 2: Seo 2014, figure 5.
 pub(super) const HITS_FAST: u8 = 2;
 
-/// With `variant = "polar"`: number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
-/// that no sensor sees again leaves the third map; not tuned.
+/// With `variant = "polar"`: number of maps for which an occupied cell without new evidence stays occupied. 2 is ours,
+/// so that an object that no sensor sees again leaves the third map; not tuned.
 pub(super) const HOLD_MAPS: u8 = 2;
 
 /// With `variant = "polar"` and ego poses: number of maps in which a cell that was clear, and then was neither
@@ -52,8 +52,8 @@ pub struct OccupancyConfig {
     /// Least height of an obstacle over the ground, metres; the vehicle drives over lower ones. 0.3 is ours, because
     /// the paper says "ego-vehicle's clearance" without a number; not tuned.
     pub clearance_m: f32,
-    /// With `variant = "paper"`: least height of a return that is not counted, metres; the vehicle passes under it. 5: Seo
-    /// 2014, section 2. The other variant has the overhang of [`crate::reach`].
+    /// With `variant = "paper"`: least height of a return that is not counted, metres; the vehicle passes under it. 5:
+    /// Seo 2014, section 2. The other variant has the overhang of [`crate::reach`].
     pub overhang_m: f32,
     /// Reliable range of the sensors, metres; cells beyond it are out of range. 150: Seo 2014, section 2.
     pub range_m_max: f32,

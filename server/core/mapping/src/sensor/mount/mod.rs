@@ -118,9 +118,9 @@ impl MountEstimate {
 /// Estimates the mount from the points of revolutions, sensor frame, metres. At most the first twenty are read.
 ///
 /// # Errors
-/// [`MountError::TooFewPoints`] if fewer than 100 cells a revolution have points; [`MountError::TooFar`] if all points of
-/// a revolution are farther than 1 km; [`MountError::NoGround`] if no plane around the vehicle can be the ground in more
-/// than half of the revolutions.
+/// [`MountError::TooFewPoints`] if fewer than 100 cells a revolution have points; [`MountError::TooFar`] if all points
+/// of a revolution are farther than 1 km; [`MountError::NoGround`] if no plane around the vehicle can be the ground in
+/// more than half of the revolutions.
 pub fn estimate<I, P>(revolutions: I) -> Result<MountEstimate, MountError>
 where
     I: IntoIterator<Item = P>,
