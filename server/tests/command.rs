@@ -171,9 +171,10 @@ fn a_file_that_cannot_be_used_is_named_with_what_to_do() {
     let (absent, here) = (at("absent.pcap"), folder.path().display().to_string());
     let (capture, recording, unknown) = (at("empty.pcap"), at("empty.mcap"), at("empty.bag"));
     let (to, png) = ("udp://127.0.0.1:9", at("out"));
-    let wrong_files: [(&[&str], &str, &str); 19] = [
+    let wrong_files: [(&[&str], &str, &str); 20] = [
         (&["info", &absent], &absent, no_file),
-        (&["info", &here], &here, is_folder),
+        (&["info", &here], &here, is_empty),
+        (&["info", &none], &none, "in this folder"),
         (&["info", &capture], &capture, is_empty),
         (&["replay", &absent], &absent, no_file),
         (&["replay", &capture], &capture, is_empty),
@@ -273,6 +274,9 @@ fn a_simulated_drive_is_a_capture_that_info_and_replay_read() {
     assert!((224..=228).contains(&packets) && (29..=31).contains(&telemetry), "{info}");
     assert_eq!(info["sensors"]["192.168.1.201"]["model"], "VLP-16");
     assert_eq!(info["sensors"]["192.168.1.201"]["refused"], serde_json::json!({}));
+    let here = folder.path().to_str().unwrap();
+    let of_folder: Value = serde_json::from_slice(&clearway(&["info", here, "--json"]).stdout).unwrap();
+    assert_eq!((&of_folder["kind"], &of_folder["files"]), (&"folder".into(), &serde_json::json!({"drive.pcap": info})));
     let replayed = clearway(&["replay", path, "--extrinsics", "0,0,1.9,0,0,0", "--json"]);
     let summary: Value = serde_json::from_slice(&replayed.stdout).unwrap();
     assert!(summary["maps"].as_u64() >= Some(2), "{summary}");

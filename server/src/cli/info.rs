@@ -1,4 +1,4 @@
-//! `clearway info`: a recording, a capture or a scan -> a description of its contents, and what is wrong with it.
+//! `clearway info`: a recording, a capture, a scan or a folder of them -> a description of its contents, and what is wrong with it.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -22,18 +22,18 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, printable};
 use clearway_daemon::base::file_advice::open_to_read;
-use clearway_daemon::ingest::files::{Kind, kind};
+use clearway_daemon::ingest::files::{Kind, files_of_folder, kind};
 use clearway_journal::channel::Channel;
 use clearway_journal::encode::event_from_bytes;
 use clearway_journal::mcap_reader::{McapReader, Message};
 
-/// Describe a file: a recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd).
+/// Describe a file: a recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd); or a folder.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway info drive.mcap
   clearway info drive.pcap --json")]
 pub struct InfoArguments {
-    /// The file; its first bytes, or else its name, give its kind.
+    /// The file; its first bytes, or else its name, give its kind. Of a folder, each file but one of its scans alone.
     file: PathBuf,
     /// Print one JSON object.
     #[arg(long)]
@@ -46,14 +46,7 @@ pub struct InfoArguments {
 /// If the file cannot be read or its kind is not known.
 pub fn run(options: &InfoArguments) -> Result<Exit> {
     let file = &options.file;
-    files::open(file)?;
-    let mut document = match kind(file)? {
-        // Its errors name the file.
-        Kind::Mcap => recording(file)?,
-        Kind::Scan => scan_file(file).with_context(|| file.display().to_string())?,
-        Kind::Capture => capture(file).with_context(|| file.display().to_string())?,
-    };
-    document["size_bytes"] = std::fs::metadata(file)?.len().into();
+    let document = if file.is_dir() { of_folder(file)? } else { of_file(file)? };
     if options.json {
         print_line(&serde_json::to_string_pretty(&document)?)?;
     } else {
@@ -63,12 +56,44 @@ pub fn run(options: &InfoArguments) -> Result<Exit> {
             }
         }
     }
-    let is_incomplete = document["complete"] == false;
-    if is_incomplete {
+    let described: Vec<(PathBuf, &Value)> = match document["files"].as_object() {
+        Some(files) => files.iter().map(|(name, document)| (file.join(name), document)).collect(),
+        None => vec![(file.clone(), &document)],
+    };
+    let mut is_incomplete = false;
+    for (file, document) in described.iter().filter(|(_, document)| document["complete"] == false) {
+        is_incomplete = true;
         let state = printable(document["state"].as_str().unwrap_or_default());
         eprintln!("clearway: {} is not whole: {state}", file.display());
     }
     Ok(Exit::from_incomplete(is_incomplete))
+}
+
+/// Describes the files of a folder in the order of a replay. Of scans, which are many, the first stands for all.
+fn of_folder(folder: &Path) -> Result<Value> {
+    let found = files_of_folder(folder)?;
+    let scans = found.iter().filter(|(_, kind)| *kind == Kind::Scan).count();
+    let mut is_first_scan = true;
+    let mut files = Map::new();
+    for (file, kind) in &found {
+        if *kind != Kind::Scan || std::mem::take(&mut is_first_scan) {
+            let name = file.file_name().unwrap_or_default().to_string_lossy();
+            files.insert(printable(&name), of_file(file)?);
+        }
+    }
+    Ok(json!({"kind": "folder", "scans": scans, "files": files}))
+}
+
+fn of_file(file: &Path) -> Result<Value> {
+    files::open(file)?;
+    let mut document = match kind(file)? {
+        // Its errors name the file.
+        Kind::Mcap => recording(file)?,
+        Kind::Scan => scan_file(file).with_context(|| file.display().to_string())?,
+        Kind::Capture => capture(file).with_context(|| file.display().to_string())?,
+    };
+    document["size_bytes"] = std::fs::metadata(file)?.len().into();
+    Ok(document)
 }
 
 /// The document as `key: value` lines; nested objects are indented.

@@ -384,7 +384,12 @@ fn kind_by_name(file: &Path) -> Option<Kind> {
     }
 }
 
-fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
+/// Finds the files of a folder whose kind is known, in the order in which they are read.
+///
+/// # Errors
+/// [`FilesError::Empty`] if there is none, [`FilesError::Converted`] if all must be converted first, or the error of a
+/// file that cannot be read.
+pub fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
     let open = |source| FilesError::Open { file: folder.to_owned(), source: advised(folder, source) };
     let (mut files, mut to_convert) = (Vec::new(), None);
     for entry in std::fs::read_dir(folder).map_err(open)? {
