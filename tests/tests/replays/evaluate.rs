@@ -162,7 +162,7 @@ fn a_gate_on_footprints_decides_the_exit_code() {
         let output = run(folder.path(), "clearway", &["evaluate", "sim:flat", "--fail-under", gate]);
         (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
     };
-    assert_eq!(gated("safe_path=99@4-20"), (Some(0), String::new()));
+    assert_eq!(gated("safe_path=99@8-20"), (Some(0), String::new()));
     let (code, said) = gated("terrain=99");
     assert!(code == Some(1) && said.contains("sim:flat : terrain=99@4-20: "), "{code:?} {said}");
     assert_eq!(gated("terrain=99@4-21").0, Some(3));
