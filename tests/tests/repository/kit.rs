@@ -23,7 +23,7 @@ async fn the_street_ahead_is_free() -> Result<(), Box<dyn std::error::Error>> {
         }
     };
     let car = Footprint { x_m: 8.0, y_m: 0.0, heading_rad: 0.0, length_m: 4.0, width_m: 2.0 };
-    assert!(!map.is_stale(now_ns()) && map.is_free("drivability", &car)?);
+    assert!(!map.is_stale(now_ns()) && map.is_free("freespace", &car)?);
     assert_eq!(map.layer("occupancy")?.class_at(8.0, 0.0).1, "clear");
     assert!(map.nearest_obstacle("occupancy", [0.0; 2], None)?.is_some_and(|obstacle| obstacle.distance_m > 1.0));
     while maps.next().await.is_ok() {} // to the end of the drive

@@ -4,13 +4,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use clearway_ros::cdr::Reader;
-use clearway_ros::frames::name;
+use clearway_ros::frames::{local_name, name};
 use clearway_ros::pose::{Odometry, TfMessage, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2};
 
-use super::choice::is_ego;
 use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
+
+/// The vehicle's frame: the first of these in the tf tree, with or without a namespace. REP-120 puts `base_footprint`
+/// on the ground.
+pub(super) const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
 
 /// Duration of the start of a file from which its topics are known if tf places a sensor there, in ns. Ours: latched
 /// transforms come first, all other messages come often.
@@ -125,6 +128,11 @@ impl AvailableTopics {
         };
         self.refused_mounts.iter().find(of_frame).map(|(_, fault)| fault.clone())
     }
+}
+
+/// True for a frame of the vehicle, with or without a namespace.
+pub(super) fn is_ego(frame: &str) -> bool {
+    EGO_FRAMES.contains(&local_name(frame))
 }
 
 /// The header stamps of the first clouds of a topic.

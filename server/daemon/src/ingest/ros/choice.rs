@@ -9,13 +9,10 @@ use clearway_ros::frames::local_name;
 use clearway_ros::{Frames, Kind};
 use nalgebra::{Isometry3, Translation3};
 
-use super::available::{AvailableTopics, Topic};
+use super::available::{AvailableTopics, EGO_FRAMES, Topic, is_ego};
 use super::decoder::{PoseSource, RAISED_M, TopicDecoder};
 use clearway_journal::reader::RecordingError;
 
-/// The vehicle's frame: the first of these in the tf tree, with or without a namespace. REP-120 puts `base_footprint`
-/// on the ground.
-const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
 /// Plausible heights of a sensor above the ground, in metres. A transform with another height belongs to an ego frame
 /// that is not on the ground.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.1..=20.0;
@@ -295,10 +292,6 @@ impl AvailableTopics {
             _ => "poses come from another topic".to_owned(),
         }
     }
-}
-
-pub(super) fn is_ego(frame: &str) -> bool {
-    EGO_FRAMES.contains(&local_name(frame))
 }
 
 fn is_fixed(frame: &str) -> bool {
