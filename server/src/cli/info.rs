@@ -1,4 +1,5 @@
-//! `clearway info`: a recording, a capture, a scan or a folder of them -> a description of its contents, and what is wrong with it.
+//! `clearway info`: a recording, a capture, a scan or a folder of them -> a description of its contents, and what is
+//! wrong with it.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
