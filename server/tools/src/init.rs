@@ -125,7 +125,7 @@ impl ReceivedDatagrams {
         let name = || file.display().to_string();
         let open = File::open(file).with_context(name)?;
         let mut capture = Capture::new(BufReader::new(open)).with_context(name)?;
-        while let Some(datagram) = capture.next() {
+        for datagram in capture.by_ref() {
             match datagram {
                 Ok(at) => self.push(at.source.ip(), at.destination_port, &at.payload, at.stamp_ns),
                 Err(error @ CaptureError::Truncated { .. }) => {

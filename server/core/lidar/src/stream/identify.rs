@@ -97,7 +97,8 @@ pub(crate) fn check(packet: &Packet<'_>, model: Model, is_given: bool) -> Result
     }
     let byte = packet.model_byte();
     let is_unknown = || !Model::ALL.iter().any(|model| model.spec().model_bytes.contains(&byte));
-    if !spec.model_bytes.is_empty() && !spec.model_bytes.contains(&byte) && !(is_given && is_unknown()) {
+    let is_allowed = spec.model_bytes.is_empty() || spec.model_bytes.contains(&byte) || is_given && is_unknown();
+    if !is_allowed {
         let allowed = spec.model_bytes.iter().map(|byte| u16::from(*byte)).collect();
         return Err(DatagramError::Model { byte, model: Some(model), allowed });
     }

@@ -9,7 +9,7 @@
 //!   unknown, so that a moving object leaves no trail, and ground under it is free only when it is seen again.
 //! - In a direction in which the newest map has no return nothing is remembered, for the sensor may be covered there;
 //!   nor is it far beyond the farthest return. A near return proves no more: from the vehicle's middle it may be seen
-//! in   another direction than from the sensor.
+//!   in another direction than from the sensor.
 //! - Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
 
 pub mod config;
@@ -333,7 +333,7 @@ mod tests {
         let near = Sweep { z: vec![0.0; x.len()], x, y, ..Sweep::default() };
         assert!(map(&mut memory, &near, 0.1) > 300);
         let recalled = || memory.extended.x.iter().zip(&memory.extended.y).skip(near.x.len());
-        let farthest_m = recalled().map(|(x, y)| x.hypot(*y)).fold(0.0, f32::max);
+        let farthest_m = recalled().map(|(x, y)| libm::hypotf(*x, *y)).fold(0.0, f32::max);
         assert!((5.0..=6.5).contains(&farthest_m), "{farthest_m}");
     }
 
