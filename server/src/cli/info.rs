@@ -70,7 +70,8 @@ pub fn run(options: &InfoArguments) -> Result<Exit> {
     Ok(Exit::from_incomplete(is_incomplete))
 }
 
-/// Describes the files of a folder in the order of a replay. Of scans, which are many, the first stands for all.
+/// Describes the files of a folder in the order of a replay. Of scans, which are many, the first stands for all. A file
+/// that cannot be read is not whole, and costs the others nothing.
 fn of_folder(folder: &Path) -> Result<Value> {
     let found = files_of_folder(folder)?;
     let scans = found.iter().filter(|(_, kind)| *kind == Kind::Scan).count();
@@ -79,7 +80,8 @@ fn of_folder(folder: &Path) -> Result<Value> {
     for (file, kind) in &found {
         if *kind != Kind::Scan || std::mem::take(&mut is_first_scan) {
             let name = file.file_name().unwrap_or_default().to_string_lossy();
-            files.insert(printable(&name), of_file(file)?);
+            let unread = |error: anyhow::Error| json!({"complete": false, "state": format!("{error:#}")});
+            files.insert(printable(&name), of_file(file).unwrap_or_else(unread));
         }
     }
     Ok(json!({"kind": "folder", "scans": scans, "files": files}))

@@ -50,7 +50,7 @@ pub struct ViewerFile {
     rasters: BTreeMap<String, Rasters>,
     /// Stamp of the newest map whose pose is written, by vehicle.
     placed: HashMap<String, i64>,
-    /// The vehicles of which the recorded poses are written.
+    /// Names of the vehicles whose recorded poses are written.
     with_poses: HashSet<String>,
     /// `None` before the first event.
     decoder: Option<ScanDecoder>,
@@ -78,7 +78,7 @@ impl ViewerFile {
         })
     }
 
-    /// Writes the points of the scan that an event completes, or its pose; `header` is that of the recording.
+    /// Writes the points of the scan that an event completes, or its pose; `header` is the recording's.
     ///
     /// # Errors
     /// If the event or the header is wrong, or the file cannot be written.

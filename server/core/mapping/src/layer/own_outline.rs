@@ -1,8 +1,8 @@
 //! The cells in the vehicle's own outline are not occupied.
 //!
 //! In: a layer, and the outline, ego frame, metres. Out: the layer in which no square whose centre lies in the outline,
-//! and no radial cell that touches it, is occupied: returns from there are those of the vehicle itself, its load or its
-//! passengers, and a layer does not state where in a cell an obstacle stands. Such a cell is unknown.
+//! and no radial cell that touches it, is occupied: the vehicle itself, its load and its passengers return light there,
+//! and a layer does not state where in a cell an obstacle stands. Such a cell is unknown.
 
 use std::f32::consts::TAU;
 
