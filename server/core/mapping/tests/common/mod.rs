@@ -171,7 +171,7 @@ pub fn benches(layer: &Layer) -> &[f32] {
     row_radius_m
 }
 
-/// Number of rows before the first ring, which have the first row's depth; 0 for a grid without rings.
+/// Number of innermost rows that are as deep as the first: the rows before the first ring.
 pub fn rows_before_rings(row_radius_m: &[f32]) -> usize {
     let depth_m = row_radius_m[0];
     1 + row_radius_m.windows(2).take_while(|pair| (pair[1] - pair[0] - depth_m).abs() < 1e-3).count()
