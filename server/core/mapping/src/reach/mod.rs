@@ -410,14 +410,16 @@ impl Reach {
     /// Decides for each polar cell whether its unseen ground counts as free of obstacles.
     fn classify_polar_cells(&mut self, confidences: &[Confidence]) {
         for column in 0..COLUMNS {
-            let mut is_hidden = false;
+            // An obstacle may hide a part of all ground behind it in its column.
+            let (mut is_hidden, mut is_behind) = (false, false);
             for row in 0..ROWS {
                 let cell = row * COLUMNS + column;
                 is_hidden = self.has_obstacle[cell] || is_hidden && confidences[cell] != Confidence::Seen;
+                is_behind |= self.has_obstacle[cell];
                 self.views[cell] = match confidences[cell] {
                     Confidence::Bridged if is_hidden => View::HiddenGap,
                     Confidence::Extrapolated | Confidence::None if is_hidden => View::Hidden,
-                    Confidence::Seen | Confidence::Bridged if self.is_beside_obstacle(row, column) => {
+                    Confidence::Seen | Confidence::Bridged if is_behind || self.is_beside_obstacle(row, column) => {
                         View::BesideObstacle
                     }
                     Confidence::Seen | Confidence::Bridged => View::Clear,

@@ -12,6 +12,10 @@ const AZIMUTHS: usize = 1440;
 /// Number of distance steps. Ours: one bit each of a 64-bit word.
 const STEPS: usize = 64;
 
+/// Least height over the ground of the lowest return of an obstacle, metres, under which ground counts as seen. Ours:
+/// ground that is seen under a lower one, such as the body of a car, lies in what stands on it.
+const UNDER_M_MIN: f32 = 1.0;
+
 /// Place of a cell's centre, in half the bytes of its azimuth and distance.
 #[derive(Clone, Copy, Debug)]
 struct Place {
@@ -55,7 +59,8 @@ impl Shadow {
             if height_m < sensor_m { distance_m * sensor_m / (sensor_m - height_m) } else { f32::INFINITY }
         };
         // The shadow begins with the step behind the obstacle.
-        let first = (meets(lowest_m.max(0.0)).max(distance_m + cell_m) * self.steps_a_m).ceil() as usize;
+        let under_m = if lowest_m < UNDER_M_MIN { 0.0 } else { lowest_m };
+        let first = (meets(under_m).max(distance_m + cell_m) * self.steps_a_m).ceil() as usize;
         let last = (meets(highest_m) * self.steps_a_m).min(STEPS as f32) as usize;
         if first >= last {
             return;
@@ -98,6 +103,8 @@ mod tests {
         let branch = shadow([1.0, 1.5]);
         assert!((20.5..22.5).contains(&branch[0]) && (38.5..41.1).contains(branch.last().unwrap()), "{branch:?}");
         assert!(shadow([1.0, 3.0]).last().unwrap() > &58.0);
+        let body = shadow([0.4, 1.0]);
+        assert_eq!(body, wall, "the ground under a body is hidden");
         assert!(shadow([0.1, 0.1]).is_empty());
     }
 
