@@ -401,9 +401,7 @@ impl Reach {
         outside.dilate(dilated, CLOSING, wide);
         hidden_gaps.remove(outside);
         // Farther away a fence returns nothing between its posts, and shadows would lead on behind it.
-        if let Some(near) = directions.near().last() {
-            hidden_gaps.keep(near);
-        }
+        directions.near().last().into_iter().for_each(|near| hidden_gaps.keep(near));
         open.add(hidden_gaps);
     }
 
