@@ -12,7 +12,10 @@ use crate::point_cloud2::Datatype;
 const OFFSET_NS_MAX: i64 = 2_000_000_000;
 /// Greatest number of points a second of a sensor. Ours: ten times the fastest sensor of 2026.
 const POINTS_PER_NS_MAX: f64 = 0.05;
-/// Least number of points of which the rate is judged.
+/// Least span of the times of a cloud, ns. Ours: the packets of nearly all sensors last longer, and times in ms that are
+/// read as µs are below it.
+const SPAN_NS_MIN: i64 = 300_000;
+/// Least number of points of which the rate and the span are judged.
 const RATED_POINTS: usize = 100;
 /// Units a second: seconds, ms, µs, ns.
 const UNITS: [f64; 4] = [1.0, 1e3, 1e6, 1e9];
@@ -20,7 +23,8 @@ const UNITS: [f64; 4] = [1.0, 1e3, 1e6, 1e9];
 /// Offset of each time from the header's stamp in ns; `None` for a time that is farther from it than 2 s.
 ///
 /// # Errors
-/// [`MessageError::Value`] if no unit and origin fit, or if all times are the same, which says nothing of the points.
+/// [`MessageError::Value`] if no unit and origin fit, if the numbers have too few bits for the ns or µs of a scan, or if
+/// all times are the same, which says nothing of the points.
 pub(crate) fn offsets(times: &[f64], datatype: Datatype, header_ns: i64) -> Result<Vec<Option<i64>>, MessageError> {
     let is_float = matches!(datatype, Datatype::Float32 | Datatype::Float64);
     let [seconds, milliseconds, microseconds, nanoseconds] = UNITS.map(TimeReading::AfterStamp);
@@ -43,6 +47,9 @@ pub(crate) fn offsets(times: &[f64], datatype: Datatype, header_ns: i64) -> Resu
         let shown = format!("{least} to {greatest} with header.stamp {header_ns} ns");
         MessageError::value("time", shown, allowed)
     };
+    if matches!(datatype, Datatype::Int8 | Datatype::Uint8 | Datatype::Int16 | Datatype::Uint16) {
+        return Err(refused("numbers of 32 or 64 bits: with fewer the unit is not known"));
+    }
     if times.len() > 1 && least == greatest {
         return Err(refused("times that differ"));
     }
@@ -55,7 +62,8 @@ pub(crate) fn offsets(times: &[f64], datatype: Datatype, header_ns: i64) -> Resu
         // Times of a clock that began with the device are small too, but far from the header.
         let is_rare = index > 0 && matches!(reading, TimeReading::AfterStamp(_));
         let is_apart = is_rare && (first_ns > span_ns || last_ns < -span_ns);
-        let is_too_fast = !is_float && n >= RATED_POINTS && n as f64 > span_ns as f64 * POINTS_PER_NS_MAX;
+        let is_too_fast = span_ns < SPAN_NS_MIN || n as f64 > span_ns as f64 * POINTS_PER_NS_MAX;
+        let is_too_fast = is_too_fast && !is_float && n >= RATED_POINTS;
         if 10 * n >= 9 * times.len() && !is_too_fast && !is_apart {
             return Ok(offsets);
         }

@@ -23,7 +23,7 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, printable};
 use clearway_daemon::base::file_advice::open_to_read;
-use clearway_daemon::ingest::files::{Kind, files_of_folder, kind};
+use clearway_daemon::ingest::files::{Kind, Truncated, files_of_folder, kind, missing_parts};
 use clearway_journal::channel::Channel;
 use clearway_journal::encode::event_from_bytes;
 use clearway_journal::mcap_reader::{McapReader, Message};
@@ -83,6 +83,10 @@ fn of_folder(folder: &Path) -> Result<Value> {
             let unread = |error: anyhow::Error| json!({"complete": false, "state": format!("{error:#}")});
             files.insert(printable(&name), of_file(file).unwrap_or_else(unread));
         }
+    }
+    for Truncated { file, reason } in missing_parts(folder) {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        files.insert(printable(&name), json!({"complete": false, "state": reason}));
     }
     Ok(json!({"kind": "folder", "scans": scans, "files": files}))
 }

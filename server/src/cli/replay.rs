@@ -190,9 +190,10 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     } else {
         print(&summary.to_text())?
     };
-    let has_no_map = summary.reached_end && summary.maps() == 0;
+    let has_no_map = summary.reached_end && !summary.shows_anything();
     if has_no_map {
-        eprintln!("clearway: the {} made no map: {}", summary.what, why_no_map(&summary.mount, &summary.snapshot));
+        let which = if summary.maps() == 0 { "no map" } else { "no map that shows anything" };
+        eprintln!("clearway: the {} made {which}: {}", summary.what, why_no_map(&summary.mount, &summary.snapshot));
     }
     Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
 }

@@ -37,7 +37,7 @@ fn timed(stamp_ns: i64, datatype: u8, bytes: impl Fn(&Ray) -> Vec<u8>) -> PointC
 async fn a_fault_of_a_part_of_a_cloud_costs_that_part_alone() {
     type Make = fn(i64) -> PointCloud2<'static>;
     // What is wrong, the cloud, the compensation, and what the notes say.
-    let cases: [(&str, Make, &str, &str); 9] = [
+    let cases: [(&str, Make, &str, &str); 11] = [
         ("nothing", |ns| velodyne("velodyne", ns), "poses", ""),
         ("row_step 0", |ns| changed(ns, |cloud| cloud.row_step = 0), "poses", ""),
         (
@@ -58,6 +58,8 @@ async fn a_fault_of_a_part_of_a_cloud_costs_that_part_alone() {
             "poses",
             "points of messages refused",
         ),
+        ("ms", |ns| timed(ns, 6, |ray| (ray.after_ns / 1_000_000).to_le_bytes().into()), "poses", ""),
+        ("8 bits", |ns| timed(ns, 2, |ray| vec![(ray.after_ns / 1_000_000) as u8]), "none", "32 or 64 bits"),
         ("equal times", |ns| timed(ns, 7, |_| vec![0; 4]), "none", "times that differ"),
         (
             "times of another clock",
@@ -82,6 +84,9 @@ async fn a_fault_of_a_part_of_a_cloud_costs_that_part_alone() {
         let (summary, headers) = replayed_bag(drive_of(3, make), &[]).await;
         assert_eq!((headers.len(), summary.snapshot.maps_with_pose), (3, 3), "{what}: {:?}", summary.notes);
         assert!(headers.iter().all(|header| header.compensation == compensation), "{what}: {:?}", headers[0]);
+        let span_ns = headers[0].capture_end_ns - headers[0].capture_start_ns;
+        let is_revolution = (SCAN_NS * 9 / 10..=SCAN_NS).contains(&span_ns);
+        assert!(is_revolution || compensation == "none", "{what}: {span_ns} ns");
         assert!(summary.notes.iter().any(|line| line.contains(note)), "{what}: {:?}", summary.notes);
         let share = summary.snapshot.drivable_share.unwrap();
         assert!(share > 0.9, "{what}: {share} drivable");
@@ -154,6 +159,52 @@ async fn when_all_stamps_step_back_no_map_has_a_pose_of_another_epoch() {
     }
 }
 
+/// 14 scans with poses from tf, whose stamps are shifted, and log times that are changed.
+fn shifted_drive(poses: impl Fn(i64) -> i64, clouds: impl Fn(i64) -> i64, logged: impl Fn(i64) -> i64) -> Vec<Message> {
+    let mut messages = tf_poses(14 * SCAN_NS, poses);
+    for end_ns in (1..=14).map(|scan| scan * SCAN_NS) {
+        let cloud = velodyne("velodyne", START_NS + end_ns - SCAN_NS + clouds(end_ns));
+        messages.push(("/points", CLOUD, START_NS + end_ns, cloud.to_cdr()));
+    }
+    messages.iter_mut().for_each(|(_, _, log_ns, _)| *log_ns = START_NS + logged(*log_ns - START_NS));
+    messages.push(mount("velodyne", LEVEL));
+    messages
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn when_one_clock_steps_no_map_has_a_pose_of_another_clock() {
+    for (of, step_ms) in ["poses", "clouds"].into_iter().flat_map(|of| [-400, -100, 100, 400].map(|ms| (of, ms))) {
+        let shift =
+            |is_of: bool| move |after_ns: i64| if is_of && after_ns >= 500_000_000 { step_ms * 1_000_000 } else { 0 };
+        let (summary, headers) =
+            replayed_bag(shifted_drive(shift(of == "poses"), shift(of == "clouds"), |ns| ns), &[]).await;
+        let what = format!("{of}, {step_ms} ms: {:?}", xs(&headers));
+        for header in &headers {
+            let Some(pose) = &header.map_from_ego else { continue };
+            let driven_m = position_m(header.completed_ns - START_NS);
+            assert!((pose.x - driven_m).abs() < 0.1, "{what}: {} m, not {driven_m} m", pose.x);
+        }
+        assert!(summary.snapshot.maps_with_pose >= 4 && headers.len() >= 12, "{what}");
+        let ahead_s = if of == "poses" { step_ms as f64 } else { -step_ms as f64 } / 1e3;
+        let way = if ahead_s > 0.0 { "ahead of" } else { "behind" };
+        let said = format!("the stamps of the poses are {:.2} s {way} its stamps since", f64::abs(ahead_s));
+        assert!(summary.to_text().contains(&said), "{what}: {}", summary.to_text());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_queue_of_a_recorder_costs_no_map_its_pose() {
+    let bursts = |after_ns: i64| (after_ns / 250_000_000 + 1) * 250_000_000 + after_ns % 1000;
+    let outage = |after_ns: i64| if (500_000_000..900_000_000).contains(&after_ns) { 900_000_000 } else { after_ns };
+    let late = |after_ns: i64| after_ns + if after_ns < 500_000_000 { 0 } else { 150_000_000 };
+    let logs: [(&str, fn(i64) -> i64); 3] = [("bursts", bursts), ("an outage", outage), ("a delay that lasts", late)];
+    for (what, logged) in logs {
+        let (summary, headers) = replayed_bag(shifted_drive(|_| 0, |_| 0, logged), &[]).await;
+        let text = summary.to_text();
+        assert!(!text.contains("one clock stepped") && headers.len() >= 10, "{what}: {text}");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_source_of_poses_is_judged_by_the_maps_that_have_one() {
     let clouds = |frame: &'static str, shift_ns: i64| {
@@ -166,7 +217,8 @@ async fn the_source_of_poses_is_judged_by_the_maps_that_have_one() {
     let poses = |child| odometry(child, 3 * SCAN_NS, |_| 0).into_iter();
     let tf = || tf_poses(3 * SCAN_NS, |_| 0).into_iter();
     // What the bag has, the maps with a pose, and what the notes say.
-    let cases: [(&str, Vec<Message>, u64, &str); 7] = [
+    let of_another_clock = || odometry("base_link", 3 * SCAN_NS, |_| -37_000_000_000).into_iter();
+    let cases: [(&str, Vec<Message>, u64, &str); 9] = [
         (
             "no child frame",
             placed("velodyne").chain(poses("")).chain(clouds("velodyne", 0)).collect(),
@@ -190,6 +242,22 @@ async fn the_source_of_poses_is_judged_by_the_maps_that_have_one() {
             placed("velodyne").chain(tf()).chain(clouds("velodyne", 37_000_000_000)).collect(),
             0,
             "37.0 s ahead of the stamps of the poses: one clock is TAI",
+        ),
+        (
+            "an odometry of another clock beside tf",
+            placed("velodyne").chain(tf()).chain(of_another_clock()).chain(clouds("velodyne", 0)).collect(),
+            3,
+            "/odom (nav_msgs/msg/Odometry) is not used: its stamps are 37.0 s behind the stamps of the scans",
+        ),
+        (
+            "an odometry on the topic of the clouds",
+            {
+                let (_, kind, log_ns, bytes) = odometry("base_link", 0, |_| 0).remove(0);
+                let other = ("/points", kind, log_ns, bytes);
+                placed("velodyne").chain([other]).chain(tf()).chain(clouds("velodyne", 0)).collect()
+            },
+            3,
+            "/points: 1 message refused, the first: a nav_msgs/msg/Odometry: allowed: PointCloud2",
         ),
         (
             "boot time",
@@ -238,14 +306,22 @@ async fn a_sensor_that_sends_empty_clouds_costs_the_others_nothing() {
         (empty.width, empty.row_step, empty.data) = (0, 0, &[]);
         messages.push(("/rear/points", CLOUD, START_NS + (scan + 1) * SCAN_NS - 1, empty.to_cdr()));
     }
-    let (_, headers) = replayed_bag(messages, &[]).await;
-    assert_eq!(headers.len(), 4);
+    let (summary, headers) = replayed_bag(messages, &[]).await;
+    assert!(headers.len() == 4 && summary.shows_anything());
     for header in headers {
         let rear = header.sensors.iter().find(|sensor| sensor.name == "rear").unwrap();
         assert_eq!((header.compensation.as_str(), rear.returns), ("poses", 0));
         assert!(["empty", "silent"].contains(&rear.state.as_str()), "{}", rear.state);
         assert!(header.capture_end_ns - header.capture_start_ns <= SCAN_NS, "the rear sensor does not begin the sweep");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_drive_without_a_return_shows_nothing() {
+    let empty = |ns| changed(ns, |cloud| (cloud.width, cloud.row_step, cloud.data) = (0, 0, &[]));
+    let (summary, headers) = replayed_bag(drive_of(3, empty), &[]).await;
+    let why = clearway_daemon::replay::summary::why_no_map(&summary.mount, &summary.snapshot);
+    assert!(headers.len() == 3 && !summary.shows_anything() && why == "none of 3 revolutions has a return", "{why}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -101,8 +101,19 @@ async fn one_drive_in_two_formats_is_refused_and_a_split_bag_is_not() {
     let late = |(topic, kind, log_ns, bytes): Message| (topic, kind, log_ns - 50_000_000, bytes);
     write_bag(&split.path().join("bag_0.mcap"), first, "cdr");
     write_bag(&split.path().join("bag_1.mcap"), second.into_iter().map(late).collect(), "cdr");
-    let options = ReplayOptions { files: vec![split.path().to_owned()], ..ReplayOptions::default() };
-    assert_eq!(replayed(options).await.unwrap().1.len(), 4);
+    let metadata = "rosbag2_bagfile_information:\n  relative_file_paths:\n    - bag_0.mcap\n    - bag_1.mcap\n";
+    let (file, options) = (split.path().join("metadata.yaml"), || ReplayOptions {
+        files: vec![split.path().to_owned()],
+        ..ReplayOptions::default()
+    });
+    std::fs::write(&file, format!("{metadata}  duration:\n")).unwrap();
+    let (summary, headers) = replayed(options()).await.unwrap();
+    assert_eq!((headers.len(), summary.truncated.len()), (4, 0));
+    // A part that metadata.yaml names and the folder does not have.
+    std::fs::write(&file, format!("{metadata}    - bag_2.mcap\n  duration:\n")).unwrap();
+    let (summary, headers) = replayed(options()).await.unwrap();
+    let missing: Vec<_> = summary.truncated.iter().map(|of| of.file.file_name().unwrap()).collect();
+    assert_eq!((headers.len(), missing), (4, vec!["bag_2.mcap".as_ref()]));
 }
 
 #[tokio::test(flavor = "multi_thread")]

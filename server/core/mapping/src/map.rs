@@ -6,7 +6,7 @@ use nalgebra::Isometry3;
 use crate::layer::Layer;
 use crate::sensor::motion::Compensation;
 
-pub use crate::sensor::state::{Contribution, ElevationSource, SensorState};
+pub use crate::sensor::state::{Contribution, ElevationSource, OtherClock, SensorState};
 
 /// The map of one vehicle, made from the scan of one sensor (its source) and the newest scans of the others.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -19,7 +19,7 @@ use crate::inputs::Inputs;
 use crate::layer::Context;
 use crate::layer::registry::Layers;
 use crate::ledger::{Ledger, Ledgers};
-use crate::map::{ElevationSource, Map};
+use crate::map::{ElevationSource, Map, OtherClock};
 use crate::map_ground::MapGround;
 use crate::sensor::mount::check::MountDeviation;
 use crate::sensor::pipeline::SensorPipeline;
@@ -63,6 +63,8 @@ pub struct NamedStatus {
     pub elevations: Option<ElevationSource>,
     /// How far the ground deviates from the configured mount; `None` before the first scan with ground.
     pub mount: Option<MountDeviation>,
+    /// The scans without a pose because the poses are of another clock.
+    pub other_clock: OtherClock,
     /// Counts of what became of everything the sensor sent.
     pub ledger: Ledger,
 }
@@ -237,6 +239,7 @@ impl Pipeline {
             status: sensor.status(),
             elevations: sensor.elevations(),
             mount: sensor.mount_deviation(),
+            other_clock: sensor.other_clock(),
             ledger: ledgers.get(index).cloned().unwrap_or_default(),
         };
         self.inputs.sensors().map(with_ledger).collect()

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use clearway_lidar::SensorStatus;
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::map::ElevationSource;
+use clearway_mapping::pipeline::NamedStatus;
 use clearway_mapping::sensor::mount::{MountError, MountEstimate};
 use serde_json::{Map, Value, json};
 
@@ -66,7 +66,7 @@ pub struct ReplaySummary {
     pub reached_end: bool,
 }
 
-/// Why no map was made, as far as the mount and the counts say it.
+/// Why no map was made, or none that shows anything, as far as the mount and the counts say it.
 pub fn why_no_map(mount: &Mount, snapshot: &Snapshot) -> String {
     if let Mount::Unknown(why) = mount {
         return format!("the mount of the sensor is not known: {why}");
@@ -75,6 +75,9 @@ pub fn why_no_map(mount: &Mount, snapshot: &Snapshot) -> String {
         return format!("the transform that places {frame_id} was refused: {fault}");
     }
     let ledger = &snapshot.ledger;
+    if snapshot.maps > 0 {
+        return format!("none of {} has a return", counted(snapshot.revolutions(), "revolution"));
+    }
     if ledger.received == 0 {
         return "the files hold no packet, scan or message that is read".to_owned();
     }
@@ -120,6 +123,12 @@ impl ReplaySummary {
     /// Number of maps of all vehicles.
     pub fn maps(&self) -> u64 {
         self.snapshot.maps + self.others.iter().map(|(_, snapshot)| snapshot.maps).sum::<u64>()
+    }
+
+    /// True if a vehicle has a map and a return: only then a map shows what is around it.
+    pub fn shows_anything(&self) -> bool {
+        let all = std::iter::once(&self.snapshot).chain(self.others.iter().map(|(_, snapshot)| snapshot));
+        all.into_iter().any(|of| of.maps > 0 && of.sensors.iter().any(|sensor| sensor.status.returns > 0))
     }
 
     /// Number of readings of all vehicles.
@@ -210,7 +219,7 @@ fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
         if several && sensor.is_reference {
             lines.push("  reference sensor: its scans make the maps".to_owned());
         }
-        lines.extend(remarks(&sensor.status).iter().map(|remark| format!("  {remark}")));
+        lines.extend(remarks(sensor).iter().map(|remark| format!("  {remark}")));
         if let Some((source, advice)) = sensor.elevations.and_then(|of| Some((of.as_str(), of.advice()?))) {
             lines.push(format!("  elevations {source}: {advice}"));
         }
@@ -228,12 +237,11 @@ fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
     lines
 }
 
-/// The counts, sensors, maps and times of one vehicle.
 /// What is remarkable about a sensor, for people: one line each.
-fn remarks(status: &SensorStatus) -> Vec<String> {
+fn remarks(NamedStatus { status, other_clock, .. }: &NamedStatus) -> Vec<String> {
     let is_blind = status.revolutions > 0 && status.returns == 0;
     let blind = is_blind.then(|| "its scans have no returns, so no map shows what is around it".to_owned());
-    status.remarks().into_iter().chain(blind).collect()
+    status.remarks().into_iter().chain(blind).chain(other_clock.describe()).collect()
 }
 
 fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
@@ -244,7 +252,7 @@ fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
             "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
             "revolutions": sensor.status.revolutions,
             "elevations": sensor.elevations.map(ElevationSource::as_str),
-            "remarks": remarks(&sensor.status),
+            "remarks": remarks(sensor),
         })
     });
     let document = json!({

@@ -170,6 +170,7 @@ fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing,
     let state = changing.states.iter().find(|state| state.name == sensor.name);
     let left_out = state.map_or("", |state| &state.state);
     let whole = state.filter(|state| state.partial.is_empty());
+    let other_clock = sensor.other_clock.describe().filter(|_| sensor.other_clock.lasts);
     SensorFacts {
         name: sensor.name.clone(),
         silent,
@@ -186,7 +187,7 @@ fn sensor_facts(sensor: &NamedStatus, senders: Vec<String>, changing: &Changing,
         clock_offset_ms: sensor.status.clock_offset_ms,
         senders,
         blocked_deg: sensor.status.blocked.sectors.iter().map(|s| f64::from(s.to_deg) - f64::from(s.from_deg)).sum(),
-        remarks: sensor.status.remarks(),
+        remarks: sensor.status.remarks().into_iter().chain(other_clock).collect(),
         mount: sensor
             .mount
             .filter(|mount| mount.contradicts)

@@ -348,6 +348,7 @@ mod tests {
             status: clearway_lidar::SensorStatus::default(),
             elevations,
             mount,
+            other_clock: Default::default(),
             ledger: Ledger::default(),
         };
         let deviation = MountDeviation { height_m: -0.58, contradicts: true, scans: 30, ..MountDeviation::default() };

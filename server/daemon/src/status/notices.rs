@@ -97,6 +97,7 @@ mod tests {
             status: clearway_lidar::SensorStatus::default(),
             elevations: Some(elevations),
             mount,
+            other_clock: Default::default(),
             ledger: clearway_mapping::ledger::Ledger::default(),
         }
     }

@@ -13,6 +13,7 @@
 //! | [`rays`] | revolution -> directions of the rays without a return; what layers read |
 //! | `state` | what a map states about a sensor |
 //! | `observation`, `config` | a scan, an ego pose; the table `[[vehicle.sensor]]` |
+//! | `stamp_clock` | stamps and event times of an input -> steps of its clock |
 //! | `model_check` | scan, configured model -> error if the scan cannot be one of it |
 //! | `rings` | scan -> elevations of the lasers, rings of the points |
 //! | [`mount`] | revolutions -> height, pitch and roll of a sensor; scans -> the ground's deviation from its mount |
@@ -30,5 +31,6 @@ pub mod ring_series;
 pub(crate) mod rings;
 pub(crate) mod scan;
 pub mod self_filter;
+pub(crate) mod stamp_clock;
 pub(crate) mod state;
 pub mod sweep;

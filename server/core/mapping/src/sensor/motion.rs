@@ -8,7 +8,7 @@
 //! |---|---|
 //! | between two poses | linear translation, spherical interpolation of the rotation |
 //! | beyond the newest pose, for at most `extrapolation_ms` | the motion of the last 50 ms before it goes on |
-//! | no pose near enough, or the poses jump within the scan | straight ahead with the newest speed |
+//! | no pose near enough, or of another clock, or the poses jump within the scan | straight ahead with the newest speed |
 //! | no speed either | the points are not moved |
 //!
 //! The result is a function of the events so far. No map waits for a pose that may arrive later, so a replay moves each
@@ -22,6 +22,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::sensor::observation::{EgoPose, Scan};
+use crate::sensor::stamp_clock::{ClockReading, PoseClock, agree};
 
 /// Number of poses that are kept. Ours: a second at 1 kHz, which is longer than a revolution of any sensor.
 const POSES_MAX: usize = 1024;
@@ -40,10 +41,6 @@ const JUMP_M_MAX: f64 = 0.5;
 /// Number of firings from one exact pose to the next; between them the matrices are interpolated. Ours: at a yaw rate
 /// of 1 rad/s the error within the millisecond of 16 firings is less than a tenth of a millimetre at 100 m.
 pub(crate) const KNOT_FIRINGS: usize = 16;
-
-/// Number of poses in a row that go back which make a step of the stamps. Ours: one pose that was overtaken on its way
-/// makes none.
-const STEP_POSES: u32 = 2;
 
 /// Time for which the motion is extrapolated after the newest pose (and before the oldest), milliseconds. 200 is
 /// ours: two revolutions at 10 Hz.
@@ -120,29 +117,6 @@ struct SpeedMeasurement {
     speed_mps: f64,
 }
 
-/// A stamp of the poses' clock, and the event time at which it arrived, ns.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct ClockReading {
-    stamp_ns: i64,
-    event_ns: i64,
-}
-
-impl ClockReading {
-    /// How far another stamp of the same clock is from the stamp that this reading lets expect at its event time, ns.
-    fn distance_ns(&self, stamp_ns: i64, event_ns: i64) -> u64 {
-        let expected_ns = self.stamp_ns.saturating_add(event_ns.saturating_sub(self.event_ns));
-        stamp_ns.abs_diff(expected_ns)
-    }
-}
-
-/// Poses in a row whose stamps are older than the newest pose.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct StepBack {
-    poses: u32,
-    /// The newest of them.
-    at: ClockReading,
-}
-
 /// What is known of one vehicle's motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Motion {
@@ -151,18 +125,23 @@ pub struct Motion {
     poses: VecDeque<EgoPose>,
     /// Event time of the first of them, ns; `None` without poses.
     began_event_ns: Option<i64>,
-    /// The newest of them.
-    newest_read: Option<ClockReading>,
-    /// The poses since then that were refused because their stamps are older.
-    step_back: Option<StepBack>,
+    pose_clock: PoseClock,
+    /// How far the clock of the scan that is being made has stepped, ns.
+    scan_step_ns: i64,
     measured: Option<SpeedMeasurement>,
 }
 
 impl Motion {
     /// A motion without poses and speeds.
     pub fn new(config: &MotionConfig) -> Self {
-        let (config, poses) = (config.clone(), VecDeque::with_capacity(POSES_MAX));
-        Self { config, poses, began_event_ns: None, newest_read: None, step_back: None, measured: None }
+        Self {
+            config: config.clone(),
+            poses: VecDeque::with_capacity(POSES_MAX),
+            began_event_ns: None,
+            pose_clock: PoseClock::default(),
+            scan_step_ns: 0,
+            measured: None,
+        }
     }
 
     /// The newest pose; `None` if there is none.
@@ -173,27 +152,21 @@ impl Motion {
     /// Removes all poses.
     pub fn forget_poses(&mut self) {
         self.poses.clear();
-        (self.began_event_ns, self.newest_read, self.step_back) = (None, None, None);
+        self.began_event_ns = None;
+        self.pose_clock.forget_poses();
     }
 
     /// Notes that a pose was refused at this event time because its stamp is older than the newest one.
     pub fn note_refused_pose(&mut self, stamp_ns: i64, event_ns: i64) {
-        let in_a_row = self.step_back.filter(|before| before.at.stamp_ns < stamp_ns).map_or(0, |before| before.poses);
-        self.step_back = Some(StepBack { poses: in_a_row + 1, at: ClockReading { stamp_ns, event_ns } });
-    }
-
-    /// The newest refused pose, if the stamps of the poses have stepped back: several poses in a row are older than the
-    /// newest one and newer than each other. A pose that was overtaken comes alone.
-    fn stepped_back(&self) -> Option<ClockReading> {
-        self.step_back.filter(|step| step.poses >= STEP_POSES).map(|step| step.at)
+        self.pose_clock.note_refused(ClockReading { stamp_ns, event_ns });
     }
 
     /// Removes the poses if their stamps have stepped back and the scan that was completed at this event time has been
-    /// stamped after the step: its stamp is nearer to the refused poses than to the poses before them.
-    pub fn note_scan(&mut self, stamp_ns: i64, event_ns: i64) {
-        if let (Some(after), Some(before)) = (self.stepped_back(), self.newest_read)
-            && after.distance_ns(stamp_ns, event_ns) < before.distance_ns(stamp_ns, event_ns)
-        {
+    /// stamped after the step: its stamp is nearer to the refused poses than to the poses before them. `step_ns` is how
+    /// far the clock of the scan has stepped: unless the clock of the poses has too, no pose is of this scan's clock.
+    pub fn note_scan(&mut self, stamp_ns: i64, event_ns: i64, step_ns: i64) {
+        self.scan_step_ns = step_ns;
+        if self.pose_clock.has_stepped_back_with(ClockReading { stamp_ns, event_ns }) {
             self.forget_poses();
         }
     }
@@ -209,12 +182,11 @@ impl Motion {
     /// Adds a pose, which must be newer than those before; they are removed if the stamps have stepped back. The oldest
     /// pose is removed if there are too many.
     pub fn push_pose(&mut self, pose: &EgoPose, event_ns: i64) {
-        if self.stepped_back().is_some() {
+        if self.pose_clock.stepped_back().is_some() {
             self.forget_poses();
         }
-        self.step_back = None;
         self.began_event_ns.get_or_insert(event_ns);
-        self.newest_read = Some(ClockReading { stamp_ns: pose.stamp_ns, event_ns });
+        self.pose_clock.note(ClockReading { stamp_ns: pose.stamp_ns, event_ns });
         debug_assert!(self.newest_pose().is_none_or(|newest| newest.stamp_ns < pose.stamp_ns), "poses in order");
         if self.poses.len() == POSES_MAX {
             self.poses.pop_front();
@@ -279,9 +251,17 @@ impl Motion {
         }
     }
 
-    /// Ego frame in the world frame and forward speed (m/s) at a stamp; `None` each if it is unknown.
+    /// How far the clock of the poses has stepped ahead of the clock of the scan that is being made, ns; `None` if the
+    /// two agree.
+    pub(super) fn ahead_of_scan_ns(&self) -> Option<i64> {
+        let pose_step_ns = self.pose_clock.step_ns();
+        (!agree(pose_step_ns, self.scan_step_ns)).then(|| pose_step_ns.saturating_sub(self.scan_step_ns))
+    }
+
+    /// Ego frame in the world frame and forward speed (m/s) at a stamp of the scan that is being made; `None` each if
+    /// it is unknown.
     pub fn at(&self, stamp_ns: i64) -> (Option<Isometry3<f64>>, Option<f64>) {
-        let pose = self.map_from_ego(stamp_ns);
+        let pose = self.map_from_ego(stamp_ns).filter(|_| self.ahead_of_scan_ns().is_none());
         let speed_mps = match pose {
             Some(_) => self.pose_speed_mps(stamp_ns),
             None => self.newest_speed_mps(stamp_ns),

@@ -34,6 +34,11 @@ pub struct Scan {
 }
 
 impl Scan {
+    /// Stamp of the first point, ns since the Unix epoch; the scan's stamp without times of points.
+    pub(crate) fn start_ns(&self) -> i64 {
+        self.stamp_ns.saturating_add(i64::from(self.offset_ns.iter().min().copied().unwrap_or(0)))
+    }
+
     /// Checks the values of the scan.
     ///
     /// # Errors

@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
-use clearway_lidar::revolution::{Partial, Revolution};
+use clearway_lidar::revolution::Revolution;
 use clearway_lidar::{CalibrationSource, Model, Sensor, SensorStatus};
 
 use nalgebra::Vector3;
@@ -27,7 +27,8 @@ use crate::sensor::rings;
 use crate::sensor::scan::SensorScan;
 use crate::sensor::self_filter::BodyConfig;
 use crate::sensor::self_filter::{RemovedPoints, SelfFilter};
-use crate::sensor::state::{Contribution, ElevationSource, SensorState};
+use crate::sensor::stamp_clock::ScanClock;
+use crate::sensor::state::{ElevationSource, OtherClock, SensorState};
 use crate::sensor::sweep::Mount;
 
 /// Number of scans from whose points the elevations are estimated. Ours: if the first scans do not show them, the later
@@ -55,6 +56,8 @@ pub(crate) struct SensorPipeline {
     newest_scan: Option<(i64, i64)>,
     /// How often the stamps of accepted scan events have gone back; `None` if that is not counted.
     scan_epoch: Option<u32>,
+    clock: ScanClock,
+    other_clock: OtherClock,
     mount_check: MountCheck,
     /// End of the newest scan, ns; `None` before the first.
     newest_end_ns: Option<i64>,
@@ -104,6 +107,8 @@ impl SensorPipeline {
             mount,
             newest_scan: None,
             scan_epoch: (ahead_ns_max > 0).then_some(0),
+            clock: ScanClock::default(),
+            other_clock: OtherClock::default(),
             mount_check: MountCheck::default(),
             newest_end_ns: None,
             scans: 0,
@@ -162,6 +167,11 @@ impl SensorPipeline {
         self.mount_check.deviation()
     }
 
+    /// The scans without a pose because the poses are of another clock.
+    pub fn other_clock(&self) -> OtherClock {
+        self.other_clock
+    }
+
     /// The newest revolution; `None` before the first.
     pub fn revolution(&self) -> Option<&Revolution> {
         self.decoder.newest()
@@ -214,7 +224,8 @@ impl SensorPipeline {
         if scan.completed > 0 && scan.is_revolution && revolution.epoch > scan.state.epoch {
             motion.begin_epoch(scan.completed_at.event_ns);
         }
-        motion.note_scan(revolution.end_ns, now.event_ns);
+        let step_ns = self.clock.note([revolution.start_ns, revolution.end_ns], now.event_ns);
+        motion.note_scan(revolution.end_ns, now.event_ns, step_ns);
         let (mount, filter) = (&self.mount, self.filter.as_ref());
         motion.follow_revolution(revolution, &mut self.trajectory);
         let sweep = scan.next_sweep();
@@ -228,7 +239,7 @@ impl SensorPipeline {
         }
         let elevations = revolution_elevations(self.decoder.status().calibration, revolution.model);
         self.elevations = Some(elevations);
-        scan.state = revolution_state(&self.name, revolution, elevations, scan.sweep.returns);
+        scan.state = SensorState::of_revolution(&self.name, revolution, elevations, scan.sweep.returns);
         (scan.start_ns, scan.end_ns, scan.is_revolution) = (revolution.start_ns, revolution.end_ns, true);
         self.complete(scan, motion, now);
         Some(removed)
@@ -255,6 +266,10 @@ impl SensorPipeline {
         if let (Some(model), ElevationSource::Model) = (self.model, self.scan_elevations) {
             model_check::check(scan, model)?;
         }
+        // A scan without points has the stamp of another part of the revolution.
+        if !scan.x.is_empty() {
+            self.clock.note([scan.start_ns(), scan.stamp_ns], now.event_ns);
+        }
         if let Some((newest_ns, accepted_ns)) = self.newest_scan
             && (scan.stamp_ns == newest_ns || now.event_ns.saturating_sub(accepted_ns) <= deadline_ns)
         {
@@ -266,7 +281,7 @@ impl SensorPipeline {
             *epoch = epoch.saturating_add(1);
             motion.begin_epoch(accepted_ns);
         }
-        motion.note_scan(scan.stamp_ns, now.event_ns);
+        motion.note_scan(scan.stamp_ns, now.event_ns, self.clock.step_ns());
         self.newest_scan = Some((scan.stamp_ns, now.event_ns));
         self.find_elevations(scan);
         motion.follow_scan(scan, &mut self.trajectory);
@@ -285,11 +300,9 @@ impl SensorPipeline {
             let is_blind = |ray: &[f32; 3]| self.filter.as_ref().is_some_and(|filter| filter.is_blind(*ray));
             newest.no_returns.extend(scan.no_returns.iter().filter(|ray| !is_blind(ray)).map(to_ego));
         }
-        newest.state = scan_state(&self.name, scan, self.scan_elevations, newest.sweep.returns, now);
+        newest.state = SensorState::of_scan(&self.name, scan, self.scan_elevations, newest.sweep.returns, now);
         newest.state.epoch = self.scan_epoch.unwrap_or(0);
-        let first_ns = scan.offset_ns.iter().min().copied().unwrap_or(0);
-        newest.start_ns = scan.stamp_ns.saturating_add(i64::from(first_ns));
-        (newest.end_ns, newest.is_revolution) = (scan.stamp_ns, false);
+        (newest.start_ns, newest.end_ns, newest.is_revolution) = (scan.start_ns(), scan.stamp_ns, false);
         (self.scans, self.scan_returns) = (self.scans + 1, self.scan_returns + u64::from(newest.sweep.returns));
         self.complete(newest, motion, now);
         Ok(removed)
@@ -317,7 +330,8 @@ impl SensorPipeline {
         scan.completed_at = now;
         scan.compensation = self.trajectory.compensation;
         scan.speed_mps = self.trajectory.speed_mps;
-        scan.map_from_ego = motion.map_from_ego(scan.end_ns);
+        scan.map_from_ego = motion.at(scan.end_ns).0;
+        self.other_clock.note(motion.ahead_of_scan_ns());
         scan.completed += 1;
     }
 }
@@ -347,69 +361,4 @@ fn revolution_elevations(source: CalibrationSource, model: Model) -> ElevationSo
         (CalibrationSource::Factory, Model::Hdl64eS1 | Model::Hdl64eS2 | Model::Hdl64eS3) => ElevationSource::Nominal,
         (CalibrationSource::Factory, _) => ElevationSource::Model,
     }
-}
-
-/// What a map states about the sensor of a revolution.
-fn revolution_state(
-    name: &Arc<str>,
-    revolution: &Revolution,
-    elevations: ElevationSource,
-    returns: u32,
-) -> SensorState {
-    SensorState {
-        name: name.clone(),
-        model: revolution.model.as_str(),
-        packets: revolution.packets,
-        packets_expected: revolution.packets_expected,
-        refused: 0,
-        returns,
-        rpm: revolution.rpm,
-        completeness: completeness(revolution),
-        partial: revolution.partial.map_or("", Partial::as_str),
-        contribution: if revolution.partial.is_some() { Contribution::Partial } else { Contribution::Ok },
-        age_ms: None,
-        blocked: revolution.blocked.clone(),
-        clock: revolution.clock.as_str(),
-        clock_offset_ms: revolution.clock_offset_ms,
-        epoch: revolution.epoch,
-        elevations: Some(elevations),
-    }
-}
-
-/// What a map states about the sensor of a scan event.
-fn scan_state(name: &Arc<str>, scan: &Scan, elevations: ElevationSource, returns: u32, now: EventTime) -> SensorState {
-    SensorState {
-        name: name.clone(),
-        model: "scan",
-        returns,
-        // The sender alone can tell which part of its field of view is missing.
-        completeness: 1.0,
-        contribution: if scan.x.is_empty() && scan.no_returns.is_empty() {
-            Contribution::Empty
-        } else {
-            Contribution::Ok
-        },
-        clock: "sender",
-        clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
-        elevations: Some(elevations),
-        ..SensorState::default()
-    }
-}
-
-/// Share of the degrees of the field of view in which a firing lies, 0 to 1.
-fn completeness(revolution: &Revolution) -> f32 {
-    let mut seen = [false; 360];
-    for firing in &revolution.firings {
-        let degree = firing.azimuth_rad.to_degrees();
-        // `as` saturates, so an azimuth of exactly 2π (or beyond) falls into the last degree.
-        seen[(degree as usize).min(359)] = true;
-    }
-    let is_in_gap = |degree: usize| {
-        revolution.fov_gap_rad.is_some_and(|ends| {
-            let [from_deg, to_deg] = ends.map(f32::to_degrees);
-            (degree as f32 - from_deg).rem_euclid(360.0) + 1.0 <= (to_deg - from_deg).rem_euclid(360.0)
-        })
-    };
-    let in_view = (0..360).filter(|&degree| seen[degree] || !is_in_gap(degree)).count();
-    seen.iter().filter(|seen| **seen).count() as f32 / in_view.max(1) as f32
 }

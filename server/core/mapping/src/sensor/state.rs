@@ -3,6 +3,10 @@
 use std::sync::Arc;
 
 use clearway_lidar::Blocked;
+use clearway_lidar::revolution::{Partial, Revolution};
+
+use crate::event_time::EventTime;
+use crate::sensor::observation::Scan;
 
 /// One sensor's state in a map. Values that describe its scan are 0 or empty if the scan is not in the map.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -41,6 +45,79 @@ pub struct SensorState {
     pub age_ms: Option<f32>,
 }
 
+impl SensorState {
+    /// What a map states about the sensor of a revolution.
+    pub(crate) fn of_revolution(
+        name: &Arc<str>,
+        revolution: &Revolution,
+        elevations: ElevationSource,
+        returns: u32,
+    ) -> Self {
+        Self {
+            name: name.clone(),
+            model: revolution.model.as_str(),
+            packets: revolution.packets,
+            packets_expected: revolution.packets_expected,
+            refused: 0,
+            returns,
+            rpm: revolution.rpm,
+            completeness: completeness(revolution),
+            partial: revolution.partial.map_or("", Partial::as_str),
+            contribution: if revolution.partial.is_some() { Contribution::Partial } else { Contribution::Ok },
+            age_ms: None,
+            blocked: revolution.blocked.clone(),
+            clock: revolution.clock.as_str(),
+            clock_offset_ms: revolution.clock_offset_ms,
+            epoch: revolution.epoch,
+            elevations: Some(elevations),
+        }
+    }
+
+    /// What a map states about the sensor of a scan event.
+    pub(crate) fn of_scan(
+        name: &Arc<str>,
+        scan: &Scan,
+        elevations: ElevationSource,
+        returns: u32,
+        now: EventTime,
+    ) -> Self {
+        Self {
+            name: name.clone(),
+            model: "scan",
+            returns,
+            // The sender alone can tell which part of its field of view is missing.
+            completeness: 1.0,
+            contribution: if scan.x.is_empty() && scan.no_returns.is_empty() {
+                Contribution::Empty
+            } else {
+                Contribution::Ok
+            },
+            clock: "sender",
+            clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
+            elevations: Some(elevations),
+            ..Self::default()
+        }
+    }
+}
+
+/// Share of the degrees of the field of view in which a firing lies, 0 to 1.
+fn completeness(revolution: &Revolution) -> f32 {
+    let mut seen = [false; 360];
+    for firing in &revolution.firings {
+        let degree = firing.azimuth_rad.to_degrees();
+        // `as` saturates, so an azimuth of exactly 2π (or beyond) falls into the last degree.
+        seen[(degree as usize).min(359)] = true;
+    }
+    let is_in_gap = |degree: usize| {
+        revolution.fov_gap_rad.is_some_and(|ends| {
+            let [from_deg, to_deg] = ends.map(f32::to_degrees);
+            (degree as f32 - from_deg).rem_euclid(360.0) + 1.0 <= (to_deg - from_deg).rem_euclid(360.0)
+        })
+    };
+    let in_view = (0..360).filter(|&degree| seen[degree] || !is_in_gap(degree)).count();
+    seen.iter().filter(|seen| **seen).count() as f32 / in_view.max(1) as f32
+}
+
 /// What the newest scan of a sensor contributes to a map, and why it contributes nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Contribution {
@@ -75,6 +152,39 @@ impl Contribution {
     /// True if the map contains points of the scan.
     pub fn is_in_map(self) -> bool {
         matches!(self, Self::Ok | Self::Partial)
+    }
+}
+
+/// The scans of a sensor that have no pose because the clock of the poses or the clock of the scans has stepped and the
+/// other has not.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct OtherClock {
+    /// Number of these scans.
+    pub scans: u64,
+    /// Step of the clock of the poses since it agreed with the clock of the scans, for the newest of these scans, ns.
+    pub ahead_ns: i64,
+    /// True if the newest scan is one of them.
+    pub lasts: bool,
+}
+
+impl OtherClock {
+    /// Notes how far the poses are ahead of a scan; `None` if the clocks agree.
+    pub(crate) fn note(&mut self, ahead_ns: Option<i64>) {
+        self.lasts = ahead_ns.is_some();
+        self.scans += u64::from(self.lasts);
+        self.ahead_ns = ahead_ns.unwrap_or(self.ahead_ns);
+    }
+
+    /// The scans and the step in one line, for people; `None` without such scans.
+    pub fn describe(&self) -> Option<String> {
+        let (scans, apart_s) = (self.scans, self.ahead_ns.unsigned_abs() as f64 * 1e-9);
+        let way = if self.ahead_ns > 0 { "ahead of" } else { "behind" };
+        (scans > 0).then(|| {
+            format!(
+                "{scans} of its scans have no pose: one clock stepped, and the stamps of the poses are {apart_s:.2} s \
+                 {way} its stamps since"
+            )
+        })
     }
 }
 

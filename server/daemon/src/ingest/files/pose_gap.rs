@@ -5,9 +5,8 @@ use std::collections::BTreeMap;
 use clearway_mapping::event::Body;
 
 use crate::ingest::queue::Reading;
+use crate::ingest::ros::available::NEAR_NS;
 
-/// Greatest distance of a scan from a pose that gives the scan a pose, in ns; as the core extrapolates.
-const NEAR_NS: u64 = 200_000_000;
 /// TAI is ahead of UTC by this much from 2017 on.
 const TAI_S: f64 = 37.0;
 

@@ -1,19 +1,27 @@
 //! The topics, frames and refused transforms of an MCAP file, from its start.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use clearway_ros::cdr::Reader;
 use clearway_ros::frames::{local_name, name};
-use clearway_ros::pose::{Odometry, TfMessage, tf_message};
+use clearway_ros::pose::{Odometry, TfMessage, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2};
+use nalgebra::Isometry3;
 
 use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// The vehicle's frame: the first of these in the tf tree, with or without a namespace. REP-120 puts `base_footprint`
 /// on the ground.
 pub(super) const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
+
+/// Greatest distance of a scan from a pose that gives the scan a pose, in ns; as the core extrapolates.
+pub(in crate::ingest) const NEAR_NS: u64 = 200_000_000;
+
+/// Greatest difference of two static transforms that state one mount, in metres and radians. Ours: they are written with
+/// that many digits.
+const SAME_MOUNT: f64 = 1e-3;
 
 /// Duration of the start of a file from which its topics are known if tf places a sensor there, in ns. Ours: latched
 /// transforms come first, all other messages come often.
@@ -28,9 +36,13 @@ pub struct AvailableTopics {
     pub(super) frames: Frames,
     /// The static transforms.
     pub(super) latched: Frames,
+    /// Stamps of the other transforms, by child frame.
+    moving: BTreeMap<String, Stamps>,
     /// Faults of refused transforms of frames that no other transform places, by child frame; empty for messages of
     /// static transforms that cannot be read at all.
     refused_mounts: BTreeMap<String, String>,
+    /// Child frames of static transforms that contradict each other.
+    pub(super) contradicted: BTreeSet<String>,
 }
 
 #[derive(Clone, Debug)]
@@ -38,7 +50,7 @@ pub(super) struct Topic {
     pub kind: Kind,
     /// Frame of a sensor's points, or child frame of an odometry; of the first readable message.
     pub frame_id: Option<String>,
-    /// Stamps of the first clouds.
+    /// Stamps of the first messages.
     pub stamps: Stamps,
     /// Most points of a message.
     pub points: u64,
@@ -77,7 +89,11 @@ impl AvailableTopics {
     fn insert(&mut self, topic: String, kind: Kind, bytes: &[u8]) {
         let (order, are_static) = (self.topics.len(), topic.ends_with("tf_static"));
         let new = Topic { kind, frame_id: None, stamps: Stamps::default(), points: 0, order, refused: None };
-        let found = self.topics.entry(topic).or_insert(new);
+        let found = self.topics.entry(topic).or_insert_with(|| new.clone());
+        // The messages of the other type are refused.
+        if kind.is_sensor() && !found.kind.is_sensor() {
+            *found = new;
+        }
         let read = match kind {
             Kind::TfMessage => match tf_message(bytes) {
                 Ok(message) => return self.insert_transforms(message, are_static),
@@ -89,15 +105,15 @@ impl AvailableTopics {
                 }
             },
             Kind::PointCloud2 => found.read_cloud(bytes),
-            _ if found.frame_id.is_some() => Ok(()),
-            Kind::VelodyneScan => {
-                VelodyneScan::new(bytes).map(|scan| found.frame_id = Some(name(scan.frame_id).to_owned()))
-            }
-            Kind::Odometry => {
-                let child = |odometry: Odometry| name(odometry.transform.child_frame_id).to_owned();
-                Odometry::new(bytes).map(|odometry| found.frame_id = Some(child(odometry)))
-            }
-            Kind::PoseStamped => Ok(()),
+            Kind::VelodyneScan => VelodyneScan::new(bytes).map(|scan| {
+                scan.packets().flatten().take(1).for_each(|(stamp_ns, _)| found.stamps.note(stamp_ns));
+                found.frame_id.get_or_insert_with(|| name(scan.frame_id).to_owned());
+            }),
+            Kind::Odometry => Odometry::new(bytes).map(|Odometry { transform, .. }| {
+                found.stamps.note(transform.header.stamp_ns);
+                found.frame_id.get_or_insert_with(|| name(transform.child_frame_id).to_owned());
+            }),
+            Kind::PoseStamped => pose_stamped(bytes).map(|pose| found.stamps.note(pose.header.stamp_ns)),
         };
         if let Err(fault) = read {
             found.refused.get_or_insert_with(|| (0, fault.to_string())).0 += 1;
@@ -108,7 +124,21 @@ impl AvailableTopics {
         for transform in &message.transforms {
             self.frames.insert(transform);
             if are_static {
+                let (parent, child) = (transform.header.frame_id, transform.child_frame_id);
+                let before = self.latched.a_from_b(parent, child);
+                let is_same = |before: Isometry3<f64>| {
+                    let change = before.inverse() * transform.parent_from_child;
+                    change.translation.vector.norm() < SAME_MOUNT && change.rotation.angle() < SAME_MOUNT
+                };
+                if self.latched.has_parent(child) && !before.is_some_and(is_same) {
+                    self.contradicted.insert(name(child).to_owned());
+                }
                 self.latched.insert(transform);
+            } else {
+                self.moving
+                    .entry(name(transform.child_frame_id).to_owned())
+                    .or_default()
+                    .note(transform.header.stamp_ns);
             }
             self.refused_mounts.remove(name(transform.child_frame_id));
         }
@@ -119,6 +149,13 @@ impl AvailableTopics {
                 self.refused_mounts.insert(child.to_owned(), transform.fault.to_string());
             }
         }
+    }
+
+    /// The stamps of the poses that tf has of a frame: of the nearest frame up from it that moves.
+    pub(super) fn stamps_above(&self, frame: &str) -> Option<&Stamps> {
+        let moving =
+            self.moving.iter().filter_map(|(child, stamps)| Some((self.frames.steps_up(frame, child)?, stamps)));
+        moving.min_by_key(|(steps, _)| *steps).map(|(_, stamps)| stamps)
     }
 
     /// Why a static transform that may place this frame was refused.
@@ -135,23 +172,31 @@ pub(super) fn is_ego(frame: &str) -> bool {
     EGO_FRAMES.contains(&local_name(frame))
 }
 
-/// The header stamps of the first clouds of a topic.
+/// The stamps of the first messages of a topic.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Stamps {
-    pub first_ns: Option<i64>,
+    /// The least and the greatest; `None` without messages.
+    range_ns: Option<(i64, i64)>,
     count: u64,
-    differ: bool,
 }
 
 impl Stamps {
     fn note(&mut self, stamp_ns: i64) {
+        let (least_ns, greatest_ns) = self.range_ns.unwrap_or((stamp_ns, stamp_ns));
+        self.range_ns = Some((least_ns.min(stamp_ns), greatest_ns.max(stamp_ns)));
         self.count += 1;
-        self.differ |= *self.first_ns.get_or_insert(stamp_ns) != stamp_ns;
     }
 
-    /// True if several clouds have one stamp.
-    pub fn stand_still(&self) -> bool {
-        self.count > 1 && !self.differ
+    /// The stamp, if several messages have it and none has another.
+    pub fn still_ns(&self) -> Option<i64> {
+        self.range_ns.filter(|(least_ns, greatest_ns)| self.count > 1 && least_ns == greatest_ns).map(|(ns, _)| ns)
+    }
+
+    /// How far the stamps are ahead of others, ns; 0 if some are near, `None` if one has no stamps.
+    pub fn ahead_ns(&self, of: &Self) -> Option<i64> {
+        let ((least_ns, greatest_ns), (of_least_ns, of_greatest_ns)) = self.range_ns.zip(of.range_ns)?;
+        let gap_ns = least_ns.saturating_sub(of_greatest_ns).max(of_least_ns.saturating_sub(greatest_ns));
+        Some(if gap_ns > NEAR_NS as i64 { least_ns.saturating_sub(of_least_ns) } else { 0 })
     }
 }
 

@@ -9,7 +9,7 @@ use clearway_ros::frames::local_name;
 use clearway_ros::{Frames, Kind};
 use nalgebra::{Isometry3, Translation3};
 
-use super::available::{AvailableTopics, EGO_FRAMES, Topic, is_ego};
+use super::available::{AvailableTopics, EGO_FRAMES, Stamps, Topic, is_ego};
 use super::decoder::{PoseSource, RAISED_M, TopicDecoder};
 use clearway_journal::reader::RecordingError;
 
@@ -76,7 +76,8 @@ impl AvailableTopics {
     /// no requested topic is a sensor, or none has poses, the choice is made here. Sensors: one topic a frame, packets
     /// before points, then the cloud with the most points; a cloud in the vehicle's frame or in a fixed frame has been
     /// merged by another program, and one in the vehicle's frame is used only if there is no other. Poses: an odometry,
-    /// else the tf chain from `map`, else from `odom`, else stamped poses.
+    /// else the tf chain from `map`, else from `odom`, else stamped poses; of these the first whose stamps are near the
+    /// stamps of the sensors.
     ///
     /// # Errors
     /// [`ChoiceError::Topic`] if the file does not have a requested topic.
@@ -97,7 +98,7 @@ impl AvailableTopics {
         }
         sensors.truncate(sensors_max);
         let pose = requested.iter().find(|topic| matches!(kind(topic), Kind::Odometry | Kind::PoseStamped));
-        let pose = pose.map(|topic| PoseSource::Topic(topic.clone())).or_else(|| self.best_pose(&ego_frame));
+        let pose = pose.map(|topic| PoseSource::Topic(topic.clone())).or_else(|| self.best_pose(&sensors, &ego_frame));
         let mut sensors: Vec<SensorTopic> =
             sensors.into_iter().map(|topic| self.sensor_topic(topic, &ego_frame)).collect();
         if !is_requested && sensors.iter().all(|sensor| sensor.ego_from_sensor.is_none()) {
@@ -138,7 +139,7 @@ impl AvailableTopics {
         let found = &self.topics[topic];
         let frame_id = found.frame_id.clone().unwrap_or_default();
         let placed_frame = self.placed_frame(&frame_id).to_owned();
-        let still_ns = found.stamps.first_ns.filter(|_| found.stamps.stand_still());
+        let still_ns = found.stamps.still_ns();
         let is_merged = is_ego(&frame_id);
         let ego_from_sensor = if is_merged {
             Some(Translation3::new(0.0, 0.0, RAISED_M).into())
@@ -189,20 +190,31 @@ impl AvailableTopics {
         best.into_iter().map(|(topic, _)| topic).collect()
     }
 
-    fn best_pose(&self, ego_frame: &str) -> Option<PoseSource> {
-        let first = |kind: Kind, fits: &dyn Fn(&Topic) -> bool| {
-            let of_kind = self.topics.iter().filter(|(_, found)| found.kind == kind && fits(found));
-            of_kind.min_by_key(|(_, found)| found.order).map(|(topic, _)| PoseSource::Topic(topic.clone()))
+    fn best_pose(&self, sensors: &[&String], ego_frame: &str) -> Option<PoseSource> {
+        let topics_of = |kind: Kind| {
+            let mut topics: Vec<_> = self.topics.iter().filter(|(_, found)| found.kind == kind).collect();
+            topics.sort_by_key(|(_, found)| found.order);
+            topics.into_iter()
         };
-        let is_joined = |found: &Topic| self.is_joined(found, ego_frame);
+        let odometries = topics_of(Kind::Odometry).filter(|(_, found)| self.is_joined(found, ego_frame));
         // A fixed frame with or without a namespace.
-        let mut fixed = FIXED_FRAMES.into_iter().filter_map(|fixed| {
+        let fixed = FIXED_FRAMES.into_iter().filter_map(|fixed| {
             let is_above = |name: &&str| local_name(name) == fixed && self.frames.a_from_b(name, ego_frame).is_some();
             self.frames.names().into_iter().find(is_above)
         });
-        first(Kind::Odometry, &is_joined)
-            .or_else(|| fixed.next().map(|fixed| PoseSource::Frames { fixed: fixed.to_owned() }))
-            .or_else(|| first(Kind::PoseStamped, &|_| true))
+        let of_topic = |(topic, _): (&String, &Topic)| PoseSource::Topic(topic.clone());
+        let of_frame = |fixed: &str| PoseSource::Frames { fixed: fixed.to_owned() };
+        let stamped = topics_of(Kind::PoseStamped).map(of_topic);
+        let all: Vec<_> = odometries.map(of_topic).chain(fixed.map(of_frame)).chain(stamped).collect();
+        let is_near = |pose: &&PoseSource| {
+            let stamps = match pose {
+                PoseSource::Topic(topic) => Some(&self.topics[topic].stamps),
+                PoseSource::Frames { .. } => self.stamps_above(ego_frame),
+            };
+            let is_near = |of: &Stamps| of.still_ns().is_some() || stamps.and_then(|own| own.ahead_ns(of)) == Some(0);
+            sensors.iter().any(|topic| is_near(&self.topics[*topic].stamps))
+        };
+        all.iter().find(is_near).or(all.first()).cloned()
     }
 
     /// True if the child frame of an odometry is the vehicle's or is joined to it. An empty one is the vehicle's.
@@ -252,8 +264,15 @@ impl AvailableTopics {
                 notes.push(format!("poses of {ego_frame} are read from tf, in {fixed}"))
             }
             None if sensors.is_empty() => {}
-            None => notes.push("no poses are read".into()),
+            None => notes.push(format!(
+                "no poses are read: an Odometry, a PoseStamped, or tf from map or odom to {ego_frame} gives them"
+            )),
         }
+        notes.extend(
+            self.contradicted
+                .iter()
+                .map(|frame| format!("static transforms place {frame} in different ways; the last of them is used")),
+        );
         let unused =
             |(topic, found): &(&String, &Topic)| !used.contains(topic.as_str()) && found.kind != Kind::TfMessage;
         let unused = self.topics.iter().filter(unused);
@@ -289,7 +308,15 @@ impl AvailableTopics {
             (Kind::Odometry, _) if !self.is_joined(found, ego_frame) => {
                 format!("no transform joins its child frame {frame} to {ego_frame}")
             }
-            _ => "poses come from another topic".to_owned(),
+            _ => {
+                let of_sensors = sensors.iter().map(|sensor| &self.topics[&sensor.topic].stamps);
+                let ahead_ns = of_sensors.filter_map(|of| found.stamps.ahead_ns(of)).min_by_key(|ns| ns.unsigned_abs());
+                match (ahead_ns.unwrap_or(0), ahead_ns.unwrap_or(0).unsigned_abs() as f64 * 1e-9) {
+                    (0, _) => "poses come from another topic".to_owned(),
+                    (1.., apart_s) => format!("its stamps are {apart_s:.1} s ahead of the stamps of the scans"),
+                    (_, apart_s) => format!("its stamps are {apart_s:.1} s behind the stamps of the scans"),
+                }
+            }
         }
     }
 }
