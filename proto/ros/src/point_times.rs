@@ -12,8 +12,8 @@ use crate::point_cloud2::Datatype;
 const OFFSET_NS_MAX: i64 = 2_000_000_000;
 /// Greatest number of points a second of a sensor. Ours: ten times the fastest sensor of 2026.
 const POINTS_PER_NS_MAX: f64 = 0.05;
-/// Least span of the times of a cloud, ns. Ours: the packets of nearly all sensors last longer, and times in ms that are
-/// read as µs are below it.
+/// Least span of the times of a cloud, ns. Ours: the packets of nearly all sensors last longer, and times in ms that
+/// are read as µs are below it.
 const SPAN_NS_MIN: i64 = 300_000;
 /// Least number of points of which the rate and the span are judged.
 const RATED_POINTS: usize = 100;
@@ -23,8 +23,8 @@ const UNITS: [f64; 4] = [1.0, 1e3, 1e6, 1e9];
 /// Offset of each time from the header's stamp in ns; `None` for a time that is farther from it than 2 s.
 ///
 /// # Errors
-/// [`MessageError::Value`] if no unit and origin fit, if the numbers have too few bits for the ns or µs of a scan, or if
-/// all times are the same, which says nothing of the points.
+/// [`MessageError::Value`] if no unit and origin fit, if the numbers have too few bits for the ns or µs of a scan, or
+/// if all times are the same, which says nothing of the points.
 pub(crate) fn offsets(times: &[f64], datatype: Datatype, header_ns: i64) -> Result<Vec<Option<i64>>, MessageError> {
     let is_float = matches!(datatype, Datatype::Float32 | Datatype::Float64);
     let [seconds, milliseconds, microseconds, nanoseconds] = UNITS.map(TimeReading::AfterStamp);

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `pipeline` | one sensor's events -> its newest scan |
 //! | `scan` | the newest scan of one sensor, as fusion and layers read it |
-//! | [`motion`] | ego poses, speed + revolution -> how the ego frame moved through it |
+//! | [`motion`] | ego poses, speed + revolution -> how the ego frame moved through it; steps of clocks |
 //! | [`self_filter`] | return -> the reason to remove it, if it does not belong to the surroundings |
 //! | [`sweep`] | revolution or scan + mount -> [`sweep::Sweep`] in the ego frame |
 //! | [`deviation`] | deviation of a range -> whole number |
@@ -13,7 +13,6 @@
 //! | [`rays`] | revolution -> directions of the rays without a return; what layers read |
 //! | `state` | what a map states about a sensor |
 //! | `observation`, `config` | a scan, an ego pose; the table `[[vehicle.sensor]]` |
-//! | `stamp_clock` | stamps and event times of an input -> steps of its clock |
 //! | `model_check` | scan, configured model -> error if the scan cannot be one of it |
 //! | `rings` | scan -> elevations of the lasers, rings of the points |
 //! | [`mount`] | revolutions -> height, pitch and roll of a sensor; scans -> the ground's deviation from its mount |
@@ -31,6 +30,5 @@ pub mod ring_series;
 pub(crate) mod rings;
 pub(crate) mod scan;
 pub mod self_filter;
-pub(crate) mod stamp_clock;
 pub(crate) mod state;
 pub mod sweep;

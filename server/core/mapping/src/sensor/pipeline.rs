@@ -17,6 +17,7 @@ use crate::event_time::EventTime;
 use crate::sensor::config::SensorConfig;
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::model_check;
+use crate::sensor::motion::stamp_clock::ScanClock;
 use crate::sensor::motion::{EgoTrajectory, Motion};
 use crate::sensor::mount::check::{MountCheck, MountDeviation};
 use crate::sensor::observation::Scan;
@@ -27,7 +28,6 @@ use crate::sensor::rings;
 use crate::sensor::scan::SensorScan;
 use crate::sensor::self_filter::BodyConfig;
 use crate::sensor::self_filter::{RemovedPoints, SelfFilter};
-use crate::sensor::stamp_clock::ScanClock;
 use crate::sensor::state::{ElevationSource, OtherClock, SensorState};
 use crate::sensor::sweep::Mount;
 

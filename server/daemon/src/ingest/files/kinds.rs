@@ -1,10 +1,88 @@
-//! A file or folder -> the files to read, with their kinds.
+//! A file or folder -> the files to read, with their kinds, or why they cannot be read.
 
 use std::io::{Error, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
-use super::{FilesError, Kind, Truncated};
+use super::capture::CaptureError;
+use super::kitti::ScanError;
+use super::mcap::McapError;
 use crate::base::file_advice::{advised, open_to_read};
+
+/// The kind of a file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// pcap or pcapng.
+    Capture,
+    /// MCAP, or a ROS 2 bag in sqlite, which is read as the MCAP file of the same messages.
+    Mcap,
+    /// One scan: KITTI `.bin`, nuScenes `.pcd.bin` or `.pcd`.
+    Scan,
+}
+
+/// Files cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum FilesError {
+    /// A file or folder cannot be opened.
+    #[error("{}: {source}", file.display())]
+    Open {
+        /// The file or folder.
+        file: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The kind of a file is unknown.
+    #[error("{}: not pcap, pcapng, MCAP, .db3, KITTI .bin, nuScenes .pcd.bin or .pcd", file.display())]
+    Kind {
+        /// The file or folder.
+        file: PathBuf,
+    },
+    /// A file can be read after it is converted.
+    #[error("{}: {what}: {advice}", file.display())]
+    Converted {
+        /// The file.
+        file: PathBuf,
+        /// What it is.
+        what: &'static str,
+        /// The command that converts it.
+        advice: String,
+    },
+    /// A folder has no file of a known kind.
+    #[error("{}: no pcap, pcapng, mcap, db3, bin or pcd file in this folder", file.display())]
+    Empty {
+        /// The file or folder.
+        file: PathBuf,
+    },
+    /// A file of a vehicle begins before the file before it has ended.
+    #[error(
+        "{}: it begins {overlap_s:.3} s before the end of the file before it; give the files of one vehicle in the \
+         order of their times, without overlap, and each drive in one format",
+        file.display()
+    )]
+    Overlap {
+        /// The later file.
+        file: PathBuf,
+        /// By how much, in seconds.
+        overlap_s: f64,
+    },
+    /// A capture cannot be read.
+    #[error(transparent)]
+    Capture(#[from] CaptureError),
+    /// An MCAP file cannot be read.
+    #[error(transparent)]
+    Mcap(#[from] McapError),
+    /// A scan cannot be read.
+    #[error(transparent)]
+    Scan(#[from] ScanError),
+}
+
+/// A file that is truncated or damaged; the readings of its whole parts were used.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Truncated {
+    /// The file.
+    pub file: PathBuf,
+    /// How the file is incomplete.
+    pub reason: String,
+}
 
 /// Finds the kind of a file.
 ///

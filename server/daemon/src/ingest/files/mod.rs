@@ -6,7 +6,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | `kinds` | file or folder -> files with their kinds |
+//! | `kinds` | file or folder -> files with their kinds, or why they cannot be read |
 //! | [`capture`] | pcap, pcapng -> readings |
 //! | [`mcap`] | recording or ROS 2 bag, in MCAP or sqlite -> readings |
 //! | `unread_topics` | channels of a bag -> what is not read of them, and what helps |
@@ -29,89 +29,11 @@ use clearway_mapping::event::Body;
 use clearway_mapping::scan_file::ScanFormat;
 
 use crate::ingest::queue::Reading;
-use capture::CaptureError;
-pub use kinds::{files_of_folder, kind, missing_parts};
-use kitti::ScanError;
-use mcap::{Before, McapError, McapOptions, RefusedMessages};
+pub use kinds::{FilesError, Kind, Truncated, files_of_folder, kind, missing_parts};
+use mcap::{Before, McapOptions, RefusedMessages};
 
 /// Greatest time by which the files of a split bag overlap, in ns. Ours: recorders write what they have buffered.
 const SPLIT_OVERLAP_NS_MAX: i64 = 5_000_000_000;
-
-/// The kind of a file.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Kind {
-    /// pcap or pcapng.
-    Capture,
-    /// MCAP, or a ROS 2 bag in sqlite, which is read as the MCAP file of the same messages.
-    Mcap,
-    /// One scan: KITTI `.bin`, nuScenes `.pcd.bin` or `.pcd`.
-    Scan,
-}
-
-/// Files cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum FilesError {
-    /// A file or folder cannot be opened.
-    #[error("{}: {source}", file.display())]
-    Open {
-        /// The file or folder.
-        file: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
-    /// The kind of a file is unknown.
-    #[error("{}: not pcap, pcapng, MCAP, .db3, KITTI .bin, nuScenes .pcd.bin or .pcd", file.display())]
-    Kind {
-        /// The file or folder.
-        file: PathBuf,
-    },
-    /// A file can be read after it is converted.
-    #[error("{}: {what}: {advice}", file.display())]
-    Converted {
-        /// The file.
-        file: PathBuf,
-        /// What it is.
-        what: &'static str,
-        /// The command that converts it.
-        advice: String,
-    },
-    /// A folder has no file of a known kind.
-    #[error("{}: no pcap, pcapng, mcap, db3, bin or pcd file in this folder", file.display())]
-    Empty {
-        /// The file or folder.
-        file: PathBuf,
-    },
-    /// A file of a vehicle begins before the file before it has ended.
-    #[error(
-        "{}: it begins {overlap_s:.3} s before the end of the file before it; give the files of one vehicle in the \
-         order of their times, without overlap, and each drive in one format",
-        file.display()
-    )]
-    Overlap {
-        /// The later file.
-        file: PathBuf,
-        /// By how much, in seconds.
-        overlap_s: f64,
-    },
-    /// A capture cannot be read.
-    #[error(transparent)]
-    Capture(#[from] CaptureError),
-    /// An MCAP file cannot be read.
-    #[error(transparent)]
-    Mcap(#[from] McapError),
-    /// A scan cannot be read.
-    #[error(transparent)]
-    Scan(#[from] ScanError),
-}
-
-/// A file that is truncated or damaged; the readings of its whole parts were used.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Truncated {
-    /// The file.
-    pub file: PathBuf,
-    /// How the file is incomplete.
-    pub reason: String,
-}
 
 /// An iterator over the readings of several files; it ends with the error of the first file that cannot be read.
 pub struct Readings {

@@ -17,10 +17,10 @@ use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader}
 pub(super) const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
 
 /// Greatest distance of a scan from a pose that gives the scan a pose, in ns; as the core extrapolates.
-pub(in crate::ingest) const NEAR_NS: u64 = 200_000_000;
+pub const NEAR_NS: u64 = 200_000_000;
 
-/// Greatest difference of two static transforms that state one mount, in metres and radians. Ours: they are written with
-/// that many digits.
+/// Greatest difference of two static transforms that state one mount, in metres and radians. Ours: they are written
+/// with that many digits.
 const SAME_MOUNT: f64 = 1e-3;
 
 /// Duration of the start of a file from which its topics are known if tf places a sensor there, in ns. Ours: latched

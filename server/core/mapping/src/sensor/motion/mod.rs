@@ -8,7 +8,7 @@
 //! |---|---|
 //! | between two poses | linear translation, spherical interpolation of the rotation |
 //! | beyond the newest pose, for at most `extrapolation_ms` | the motion of the last 50 ms before it goes on |
-//! | no pose near enough, or of another clock, or the poses jump within the scan | straight ahead with the newest speed |
+//! | no pose near enough or of the scan's clock, or the poses jump within the scan | straight ahead with the newest speed |
 //! | no speed either | the points are not moved |
 //!
 //! The result is a function of the events so far. No map waits for a pose that may arrive later, so a replay moves each
@@ -22,7 +22,11 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::sensor::observation::{EgoPose, Scan};
-use crate::sensor::stamp_clock::{ClockReading, PoseClock, agree};
+pub(crate) use knots::{KNOT_FIRINGS, ScanKnots, knots};
+use stamp_clock::{ClockReading, PoseClock, agree};
+
+mod knots;
+pub(super) mod stamp_clock;
 
 /// Number of poses that are kept. Ours: a second at 1 kHz, which is longer than a revolution of any sensor.
 const POSES_MAX: usize = 1024;
@@ -38,10 +42,6 @@ const SPEED_MPS_MAX: f64 = 100.0;
 /// Distance that two poses may be apart at any speed without counting as a jump, metres. Ours: the step of a receiver
 /// that changes its set of satellites.
 const JUMP_M_MAX: f64 = 0.5;
-/// Number of firings from one exact pose to the next; between them the matrices are interpolated. Ours: at a yaw rate
-/// of 1 rad/s the error within the millisecond of 16 firings is less than a tenth of a millimetre at 100 m.
-pub(crate) const KNOT_FIRINGS: usize = 16;
-
 /// Time for which the motion is extrapolated after the newest pose (and before the oldest), milliseconds. 200 is
 /// ours: two revolutions at 10 Hz.
 pub(super) const EXTRAPOLATION_MS: u32 = 200;
@@ -97,12 +97,6 @@ pub struct EgoTrajectory {
     /// `end_from_ego` at firings 0, 16, 32, and so on, and at the last one; for a scan at 2 to 257 evenly spaced times.
     /// Empty if the points are not trajectory.
     pub end_from_ego: Vec<Isometry3<f64>>,
-}
-
-/// Indices of the firings at which [`EgoTrajectory::end_from_ego`] is exact.
-pub(crate) fn knots(firings: usize) -> impl ExactSizeIterator<Item = usize> + Clone {
-    let count = if firings == 0 { 0 } else { (firings - 1).div_ceil(KNOT_FIRINGS) + 1 };
-    (0..count).map(move |knot| (knot * KNOT_FIRINGS).min(firings - 1))
 }
 
 /// The newest speed from a sensor's telemetry.
@@ -350,48 +344,6 @@ impl Motion {
 
 fn straight_ahead(speed_mps: f64, from_ns: i64, to_ns: i64) -> Isometry3<f64> {
     Isometry3::translation(from_ns.saturating_sub(to_ns) as f64 * 1e-9 * speed_mps, 0.0, 0.0)
-}
-
-/// The times of a scan at which [`EgoTrajectory::end_from_ego`] is exact: evenly spaced from its first point to its
-/// stamp.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct ScanKnots {
-    /// Time from the first point to the stamp, ns; `None` if the scan does not state the times of its points.
-    span_ns: Option<i64>,
-}
-
-impl ScanKnots {
-    /// Least time between two knots, ns. Ours: within a millisecond a straight line is as good as the arc, as between
-    /// the knots of a revolution.
-    const STEP_NS: i64 = 1_000_000;
-    /// Greatest number of steps. Ours: a scan of any length takes little memory.
-    const STEPS_MAX: i64 = 256;
-
-    pub(crate) fn from_scan(scan: &Scan) -> Self {
-        Self { span_ns: scan.offset_ns.iter().min().map(|first| -i64::from(*first)) }
-    }
-
-    fn steps(&self) -> i64 {
-        self.span_ns.map_or(0, |span_ns| (span_ns / Self::STEP_NS).clamp(1, Self::STEPS_MAX))
-    }
-
-    fn count(&self) -> usize {
-        self.span_ns.map_or(0, |_| self.steps() as usize + 1)
-    }
-
-    fn offset_ns(&self, knot: usize) -> i64 {
-        let span_ns = self.span_ns.unwrap_or(0);
-        span_ns * knot as i64 / self.steps().max(1) - span_ns
-    }
-
-    /// Index of the last knot before a point, never that of the last of all, and the share of the step to the next one.
-    #[inline(always)]
-    pub(crate) fn position(&self, offset_ns: i32) -> (usize, f32) {
-        let span_ns = self.span_ns.unwrap_or(0);
-        let steps = (i64::from(offset_ns) + span_ns) as f32 * self.steps() as f32 / span_ns.max(1) as f32;
-        let knot = (steps as usize).min((self.steps() as usize).saturating_sub(1));
-        (knot, steps - knot as f32)
-    }
 }
 
 fn share(from_ns: i64, to_ns: i64, stamp_ns: i64) -> f64 {

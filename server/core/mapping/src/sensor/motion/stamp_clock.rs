@@ -156,8 +156,8 @@ impl PoseClock {
         self.step_back.filter(|step| step.poses >= STEP_POSES).map(|step| step.at)
     }
 
-    /// True if the stamps of the poses have stepped back, and the stamp of this scan is nearer to the refused poses than
-    /// to the poses before them.
+    /// True if the stamps of the poses have stepped back, and the stamp of this scan is nearer to the refused poses
+    /// than to the poses before them.
     pub fn has_stepped_back_with(&self, scan: ClockReading) -> bool {
         let (after, before) = (self.stepped_back(), self.newest);
         after.zip(before).is_some_and(|(after, before)| after.distance_ns(&scan) < before.distance_ns(&scan))
@@ -166,7 +166,7 @@ impl PoseClock {
 
 /// The clock of a sensor's scans.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct ScanClock {
+pub(in crate::sensor) struct ScanClock {
     /// Of the first points, and of the last points.
     ends: [StampClock; 2],
 }
