@@ -13,7 +13,7 @@ const STEP_NS_MIN: u64 = 50_000_000;
 /// Number of messages by which the next one is judged. Ours: an outage is out of the window after a second at 10 Hz.
 const WINDOW: usize = 8;
 /// Least number of messages by which the next one is judged.
-const WINDOW_MIN: usize = 4;
+const WINDOW_MIN: usize = 3;
 /// Number of poses in a row that go back which make a step of the stamps. Ours: one pose that was overtaken on its way
 /// makes none.
 const STEP_POSES: u32 = 2;
@@ -217,7 +217,7 @@ mod tests {
             ("ahead and back", 0, |i| Some((100 * i + if (20..40).contains(&i) { 300 } else { 0 }, 100 * i))),
             ("back by a spacing", -100, |i| Some((100 * i - if i < 20 { 0 } else { 100 }, 100 * i))),
             ("ahead, with jitter", 100, |i| Some((100 * i + if i < 20 { 0 } else { 100 }, 100 * i + 37 * i % 45))),
-            ("back by 20 s", -20_000, |i| Some((100 * i - if i < 4 { 0 } else { 20_000 }, 100 * i))),
+            ("back by 20 s", -20_000, |i| Some((100 * i - if i < 3 { 0 } else { 20_000 }, 100 * i))),
             ("twice", 250, |i| Some((100 * i + i / 20 * 125, 100 * i + 30))),
         ];
         for (what, step_ms, make) in cases {
