@@ -120,6 +120,8 @@ struct StepBack {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct PoseClock {
     clock: StampClock,
+    /// How far the clock had stepped at the newest pose that is kept, ns.
+    step_ns: i64,
     /// The newest pose that is kept.
     newest: Option<ClockReading>,
     /// The poses since then that were refused because their stamps are older.
@@ -127,9 +129,9 @@ pub(super) struct PoseClock {
 }
 
 impl PoseClock {
-    /// How far the clock has stepped since its first pose, ns; 0 if it has stepped back.
+    /// How far the clock of the poses that are kept has stepped since its first pose, ns; 0 if it has stepped back.
     pub fn step_ns(&self) -> i64 {
-        self.clock.step_ns()
+        self.step_ns
     }
 
     /// Forgets the poses, and not the clock.
@@ -140,7 +142,7 @@ impl PoseClock {
     /// Notes a pose that is kept.
     pub fn note(&mut self, pose: ClockReading) {
         self.clock.note(pose);
-        (self.newest, self.step_back) = (Some(pose), None);
+        (self.step_ns, self.newest, self.step_back) = (self.clock.step_ns(), Some(pose), None);
     }
 
     /// Notes a pose that was refused because its stamp is older than the newest one.
