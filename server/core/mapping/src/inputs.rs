@@ -79,7 +79,7 @@ impl Inputs {
     /// Applies one event.
     ///
     /// # Errors
-    /// [`EventError`] if the event is refused; then nothing has changed.
+    /// [`EventError`] if the event is refused; then nothing has changed but what its stamp shows of its clock.
     pub fn apply(&mut self, event: &Event, now: EventTime) -> Result<Outcome, EventError> {
         let outcome = match &event.body {
             Body::Datagram(payload) => self.apply_datagram(event.source, payload, now)?,

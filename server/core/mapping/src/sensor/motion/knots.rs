@@ -12,8 +12,8 @@ pub(crate) fn knots(firings: usize) -> impl ExactSizeIterator<Item = usize> + Cl
     (0..count).map(move |knot| (knot * KNOT_FIRINGS).min(firings - 1))
 }
 
-/// The times of a scan at which [`super::EgoTrajectory::end_from_ego`] is exact: evenly spaced from its first point to its
-/// stamp.
+/// The times of a scan at which [`super::EgoTrajectory::end_from_ego`] is exact: evenly spaced from its first point to
+/// its stamp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ScanKnots {
     /// Time from the first point to the stamp, ns; `None` if the scan does not state the times of its points.

@@ -8,7 +8,7 @@
 //! |---|---|
 //! | between two poses | linear translation, spherical interpolation of the rotation |
 //! | beyond the newest pose, for at most `extrapolation_ms` | the motion of the last 50 ms before it goes on |
-//! | no pose near enough or of the scan's clock, or the poses jump within the scan | straight ahead with the newest speed |
+//! | no pose near enough or of its clock, or the poses jump within the scan | straight ahead with the newest speed |
 //! | no speed either | the points are not moved |
 //!
 //! The result is a function of the events so far. No map waits for a pose that may arrive later, so a replay moves each

@@ -168,7 +168,7 @@ impl PoseClock {
 
 /// The clock of a sensor's scans.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(in crate::sensor) struct ScanClock {
+pub(crate) struct ScanClock {
     /// Of the first points, and of the last points.
     ends: [StampClock; 2],
 }
