@@ -12,18 +12,28 @@ use std::time::{Duration, Instant};
 
 use clearway_proto::v1;
 use prost::Message;
+use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
+use crate::base::clock::now_ns;
 use crate::base::sync::locked;
+use crate::config;
 
 /// Time after its last announcement at which a vehicle is no longer listed. Ours: two lost announcements and the delay
 /// of a bad link.
 const SILENT_MAX: Duration = Duration::from_secs(4);
-/// Most vehicles of other servers. Ours: some megabytes; further ones are passed over.
-const VEHICLES_MAX: usize = 4096;
+/// Most memory of the vehicles of other servers, in bytes, by [`decoded_bytes`]. Ours: some thousand vehicles with one
+/// sensor, five hundred with eight.
+const BYTES_MAX: usize = 16 << 20;
 /// Longest announcement, in bytes. Ours: a vehicle with eight sensors takes some 4 KiB.
 const ANNOUNCEMENT_BYTES_MAX: usize = 64 << 10;
+/// Most memory of one vehicle, in bytes, by [`decoded_bytes`]. Ours: ten vehicles with eight sensors.
+const VEHICLE_BYTES_MAX: usize = 256 << 10;
+/// Depth of messages in a vehicle: the counts of a sensor's ledger by reason.
+const DEPTH_MAX: u32 = 3;
 /// Longest name of a vehicle or server, in bytes. Ours: names of vehicles in the configuration are shorter.
 const NAME_BYTES_MAX: usize = 256;
+/// Time by which the newest map of another server may be ahead of this host's clock, in ns. Ours: two clocks of hosts.
+const AHEAD_NS_MAX: i64 = 1_000_000_000;
 
 /// The vehicles of other servers, by name of the vehicle and run of its server. Clones share them. Empty without zenoh.
 #[derive(Clone, Debug, Default)]
@@ -32,26 +42,54 @@ pub struct Fleet(Arc<Mutex<BTreeMap<(String, u64), Announced>>>);
 #[derive(Debug)]
 struct Announced {
     vehicle: v1::Vehicle,
+    /// Memory of the vehicle, by [`decoded_bytes`].
+    bytes: usize,
     heard: Instant,
 }
 
+/// Why an announcement is not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum AnnouncementRefused {
+    /// It is no [`v1::Vehicle`], is too long or takes too much memory, or its name is missing or too long.
+    #[error("an announcement of another server is no vehicle, or too large a one")]
+    Invalid,
+    /// The vehicles that are listed take the memory.
+    #[error("the vehicles of other servers take {} MiB, which are allowed: further ones are not listed", BYTES_MAX >> 20)]
+    Full,
+}
+
 impl Fleet {
-    /// Takes an announcement, an encoded [`v1::Vehicle`], at the time `now`. A message that cannot be one is passed
-    /// over.
-    pub fn hear(&self, announcement: &[u8], now: Instant) {
-        if announcement.len() > ANNOUNCEMENT_BYTES_MAX {
-            return;
-        }
-        let Ok(vehicle) = v1::Vehicle::decode(announcement) else { return };
+    /// Takes an announcement, an encoded [`v1::Vehicle`], at the time `now`. An address or URL that the configuration
+    /// would refuse is left out of it, and so is a newest map that lies in the future.
+    ///
+    /// # Errors
+    /// Why it is not taken.
+    pub fn hear(&self, announcement: &[u8], now: Instant) -> Result<(), AnnouncementRefused> {
+        let bytes = Some(announcement).filter(|of| of.len() <= ANNOUNCEMENT_BYTES_MAX);
+        let bytes = bytes.and_then(|of| decoded_bytes(of, 0)).filter(|bytes| *bytes <= VEHICLE_BYTES_MAX);
+        let bytes = bytes.ok_or(AnnouncementRefused::Invalid)?;
+        let mut vehicle = v1::Vehicle::decode(announcement).map_err(|_| AnnouncementRefused::Invalid)?;
         let names = [&vehicle.name, &vehicle.server, &vehicle.grpc, &vehicle.page];
         if vehicle.name.is_empty() || names.iter().any(|name| name.len() > NAME_BYTES_MAX) {
-            return;
+            return Err(AnnouncementRefused::Invalid);
+        }
+        if !config::Grpc::is_address(&vehicle.grpc) {
+            vehicle.grpc.clear();
+        }
+        if !config::Page::is_url(&vehicle.page) {
+            vehicle.page.clear();
+        }
+        if vehicle.newest_capture_end_ns > now_ns() + AHEAD_NS_MAX {
+            vehicle.newest_capture_end_ns = 0;
         }
         let key = (vehicle.name.clone(), vehicle.boot_id);
         let mut vehicles = self.heard(now);
-        if vehicles.len() < VEHICLES_MAX || vehicles.contains_key(&key) {
-            vehicles.insert(key, Announced { vehicle, heard: now });
+        let others: usize = vehicles.iter().filter(|(other, _)| **other != key).map(|(_, of)| of.bytes).sum();
+        if others + bytes > BYTES_MAX {
+            return Err(AnnouncementRefused::Full);
         }
+        vehicles.insert(key, Announced { vehicle, bytes, heard: now });
+        Ok(())
     }
 
     /// The vehicles of other servers at the time `now`, by name. A name that several servers claim is there several
@@ -67,12 +105,44 @@ impl Fleet {
         of_name.max_by_key(|vehicle| (!vehicle.grpc.is_empty(), vehicle.newest_capture_end_ns))
     }
 
+    /// Forgets the vehicles of silent servers again and again, so that their memory is free without a reader.
+    pub async fn forget_silent(self) {
+        let mut every = tokio::time::interval(SILENT_MAX);
+        loop {
+            every.tick().await;
+            drop(self.heard(Instant::now()));
+        }
+    }
+
     /// The vehicles whose servers are not silent at the time `now`.
     fn heard(&self, now: Instant) -> MutexGuard<'_, BTreeMap<(String, u64), Announced>> {
         let mut vehicles = locked(&self.0);
         vehicles.retain(|_, announced| now.saturating_duration_since(announced.heard) <= SILENT_MAX);
         vehicles
     }
+}
+
+/// Upper bound of the memory of a decoded vehicle, in bytes, from its encoding: for each text, element of a list and
+/// entry of a map its length and its type, so that a list of empty elements is not cheap. `None` if it is no encoding.
+fn decoded_bytes(mut encoded: &[u8], depth: u32) -> Option<usize> {
+    let (mut bytes, element_bytes) = match depth {
+        0 => (size_of::<v1::Vehicle>(), size_of::<v1::SensorState>().max(size_of::<(String, v1::Ledger)>())),
+        // Elements of a sensor, a ledger or the recorder hold two texts at most.
+        _ => (0, 2 * size_of::<String>() + 32),
+    };
+    while !encoded.is_empty() {
+        let (tag, wire) = decode_key(&mut encoded).ok()?;
+        if wire != WireType::LengthDelimited {
+            skip_field(wire, tag, &mut encoded, DecodeContext::default()).ok()?;
+            continue;
+        }
+        let length = usize::try_from(decode_varint(&mut encoded).ok()?).ok()?;
+        let (element, rest) = encoded.split_at_checked(length)?;
+        let of_element = if depth < DEPTH_MAX { decoded_bytes(element, depth + 1) } else { None };
+        bytes += element_bytes + length + of_element.unwrap_or(0);
+        encoded = rest;
+    }
+    Some(bytes)
 }
 
 #[cfg(test)]
@@ -99,7 +169,7 @@ mod tests {
     #[test]
     fn a_vehicle_is_listed_until_its_server_is_silent() {
         let (fleet, start) = (Fleet::default(), Instant::now());
-        fleet.hear(&announcement("van", 1, "a:1", 0), start);
+        fleet.hear(&announcement("van", 1, "a:1", 0), start).unwrap();
         assert_eq!(fleet.vehicles(start + SILENT_MAX).len(), 1);
         assert_eq!(address(&fleet, "van", start + SILENT_MAX).as_deref(), Some("a:1"));
         let late = start + SILENT_MAX + Duration::from_millis(1);
@@ -110,34 +180,68 @@ mod tests {
     #[test]
     fn two_servers_with_one_vehicle_are_both_listed_and_the_newest_map_leads() {
         let (fleet, now) = (Fleet::default(), Instant::now());
-        fleet.hear(&announcement("van", 7, "old:1", 100), now);
-        fleet.hear(&announcement("van", 3, "new:1", 200), now);
-        fleet.hear(&announcement("vans", 4, "other:1", 900), now);
+        let hear = |name, boot_id, grpc, newest| fleet.hear(&announcement(name, boot_id, grpc, newest), now).unwrap();
+        hear("van", 7, "old:1", 100);
+        hear("van", 3, "new:1", 200);
+        hear("vans", 4, "other:1", 900);
         assert_eq!(fleet.vehicles(now).len(), 3);
         assert_eq!(address(&fleet, "van", now).as_deref(), Some("new:1"));
-        fleet.hear(&announcement("van", 9, "", 300), now);
+        hear("van", 9, "", 300);
         assert_eq!(address(&fleet, "van", now).as_deref(), Some("new:1"), "the newest announces no address");
+        hear("van", 5, "forged:1", i64::MAX);
+        hear("van", 6, "javascript:alert(1)", 400);
+        assert_eq!(address(&fleet, "van", now).as_deref(), Some("new:1"), "a map of the future, and no address");
         assert_eq!(address(&fleet, "bus", now), None);
     }
 
     #[test]
-    fn what_is_no_announcement_is_passed_over() {
+    fn a_url_that_is_no_page_is_not_passed_on() {
         let (fleet, now) = (Fleet::default(), Instant::now());
-        fleet.hear(&[0xff; 9], now);
-        fleet.hear(&vec![0; ANNOUNCEMENT_BYTES_MAX + 1], now);
-        fleet.hear(&announcement("", 1, "a:1", 0), now);
-        fleet.hear(&announcement(&"v".repeat(NAME_BYTES_MAX + 1), 1, "a:1", 0), now);
+        for (page, passed) in [("https://van:8080/", "https://van:8080/"), ("javascript:alert(1)", "")] {
+            let vehicle = v1::Vehicle { name: "van".into(), page: page.into(), ..Default::default() };
+            fleet.hear(&vehicle.encode_to_vec(), now).unwrap();
+            assert_eq!(fleet.vehicles(now)[0].page, passed);
+        }
+    }
+
+    #[test]
+    fn what_is_no_announcement_is_refused() {
+        let (fleet, now) = (Fleet::default(), Instant::now());
+        let of_empty_sensors = v1::Vehicle { sensors: vec![Default::default(); 32_000], ..Default::default() };
+        for announcement in [
+            vec![0xff; 9],
+            vec![0; ANNOUNCEMENT_BYTES_MAX + 1],
+            announcement("", 1, "a:1", 0),
+            announcement(&"v".repeat(NAME_BYTES_MAX + 1), 1, "a:1", 0),
+            v1::Vehicle { name: "van".into(), ..of_empty_sensors }.encode_to_vec(),
+        ] {
+            assert_eq!(fleet.hear(&announcement, now), Err(AnnouncementRefused::Invalid));
+        }
         assert_eq!(fleet.vehicles(now), []);
     }
 
     #[test]
-    fn a_flood_of_names_keeps_the_vehicles_that_are_known() {
+    fn a_flood_of_vehicles_takes_its_memory_and_keeps_the_vehicles_that_are_known() {
         let (fleet, now) = (Fleet::default(), Instant::now());
-        for n in 0..VEHICLES_MAX + 10 {
-            fleet.hear(&announcement(&format!("car {n}"), 1, "", 0), now);
-        }
-        fleet.hear(&announcement("car 0", 1, "a:1", 0), now);
-        assert_eq!(fleet.vehicles(now).len(), VEHICLES_MAX);
-        assert_eq!(address(&fleet, "car 0", now).as_deref(), Some("a:1"));
+        let vehicle = |n: usize| {
+            let sensors = vec![v1::SensorState { name: "top".into(), ..Default::default() }; 200];
+            v1::Vehicle { name: format!("car {n}"), sensors, ..Default::default() }.encode_to_vec()
+        };
+        let taken = (0..4096).take_while(|n| fleet.hear(&vehicle(*n), now).is_ok()).count();
+        assert_eq!(fleet.hear(&vehicle(taken), now), Err(AnnouncementRefused::Full));
+        let sensors = fleet.vehicles(now).iter().map(|vehicle| vehicle.sensors.len()).sum::<usize>();
+        let bytes = sensors * (size_of::<v1::SensorState>() + "top".len());
+        assert!((BYTES_MAX / 2..BYTES_MAX).contains(&bytes), "{taken} vehicles of {bytes} bytes");
+        assert_eq!(fleet.hear(&vehicle(0), now), Ok(()));
+    }
+
+    #[tokio::test]
+    async fn a_silent_vehicle_is_forgotten_without_a_reader() {
+        let fleet = Fleet::default();
+        let heard = Instant::now().checked_sub(2 * SILENT_MAX).expect("a host that runs for eight seconds");
+        fleet.hear(&announcement("van", 1, "a:1", 0), heard).unwrap();
+        // It begins at once.
+        tokio::time::timeout(Duration::ZERO, fleet.clone().forget_silent()).await.unwrap_err();
+        assert!(locked(&fleet.0).is_empty());
     }
 }

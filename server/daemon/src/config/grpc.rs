@@ -120,8 +120,7 @@ impl Grpc {
             let allowed = "a name of readers, ingesters, operators or tokens";
             return Err(ValueError::new("grpc.access.only", name, allowed));
         }
-        let (_, port) = host_and_port(&self.advertise);
-        if self.advertise.contains("//") || port.is_some_and(|port| port.parse::<u16>().is_err()) {
+        if !Self::is_address(&self.advertise) {
             let allowed = "a host such as \"vehicle-7.example\", or host and port such as \"10.0.0.7:50051\"";
             return Err(ValueError::new("grpc.advertise", &self.advertise, allowed));
         }
@@ -129,6 +128,12 @@ impl Grpc {
             return Err(ValueError::new("grpc.connections_max", self.connections_max, "1 to 65536 connections"));
         }
         Ok(())
+    }
+
+    /// True if it may be the address of a server, with or without a port; empty: none.
+    pub(crate) fn is_address(address: &str) -> bool {
+        let (_, port) = host_and_port(address);
+        !address.contains("//") && port.is_none_or(|port| port.parse::<u16>().is_ok())
     }
 
     /// The address, `HOST:PORT`, at which other machines reach gRPC when it listens on `bound`; `None` if they cannot.

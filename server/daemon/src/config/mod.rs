@@ -115,9 +115,13 @@ impl Default for Page {
 }
 
 impl Page {
+    /// True if it may be the URL of a page.
+    pub(crate) fn is_url(url: &str) -> bool {
+        ["http://", "https://"].iter().any(|scheme| url.starts_with(scheme))
+    }
+
     fn check(&self) -> Result<(), ValueError> {
-        let is_url = ["http://", "https://"].iter().any(|scheme| self.advertise.starts_with(scheme));
-        if !self.advertise.is_empty() && !is_url {
+        if !self.advertise.is_empty() && !Self::is_url(&self.advertise) {
             return Err(ValueError::new("page.advertise", &self.advertise, "http://HOST:PORT/ or https://HOST:PORT/"));
         }
         if !(1..=65_536).contains(&self.connections_max) {

@@ -14,6 +14,7 @@ use zenoh::qos::Priority;
 use zenoh::sample::Locality;
 
 use super::served::Vehicles;
+use crate::base::token_bucket::TokenBucket;
 use crate::fleet::Fleet;
 use crate::zenoh_session::{ZenohError, declare_publisher};
 
@@ -51,15 +52,23 @@ pub(crate) async fn announce(
     Ok(())
 }
 
-/// Hears the announcements of other servers until the subscriber is dropped.
+/// Hears the announcements of other servers until the subscriber is dropped. Refused ones are logged, at most one a
+/// second.
 ///
 /// # Errors
 /// [`ZenohError`] if the subscriber cannot be declared.
 pub(crate) async fn hear(session: &Session, fleet: Fleet) -> Result<Subscriber<()>, ZenohError> {
+    let mut lines = TokenBucket::new(1, 1);
     session
         .declare_subscriber(ALL)
         .allowed_origin(Locality::Remote)
-        .callback(move |sample| fleet.hear(&sample.payload().to_bytes(), Instant::now()))
+        .callback_mut(move |sample| {
+            if let Err(error) = fleet.hear(&sample.payload().to_bytes(), Instant::now())
+                && lines.take()
+            {
+                tracing::warn!(%error, key = %sample.key_expr(), "zenoh: announcement refused");
+            }
+        })
         .await
         .map_err(ZenohError::of(format!("subscriber {ALL}")))
 }

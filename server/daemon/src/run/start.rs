@@ -180,6 +180,7 @@ impl Running {
             self.spawn_until_stopped(save_rules::watch(config.clone(), self.vehicles.clone(), recorder.control()));
         }
         self.spawn_until_stopped(watch_states(self.vehicles.statuses()));
+        self.spawn_until_stopped(self.fleet.clone().forget_silent());
         self.serve(listeners, gateways);
         self.start_udp(sockets)
     }
