@@ -179,3 +179,70 @@ fn of_a_bag_with_a_damaged_page_the_messages_that_cannot_be_read_are_counted() {
     assert!(incomplete.contains(&format!("{} messages after the time {read}", 100 - read)), "{read}: {incomplete}");
     assert!(read >= 64, "{read}: a batch before the damage is read");
 }
+
+#[test]
+fn a_bag_that_computes_what_it_holds_is_refused_by_name() {
+    let topics = "CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+        INSERT INTO topics VALUES (1, '/points', 'sensor_msgs/msg/PointCloud2', 'cdr');";
+    let table = "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB";
+    let endless = "WITH RECURSIVE n (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i, 1, i, zeroblob(9) FROM n";
+    for (messages, named) in [
+        (
+            format!("CREATE VIEW Messages (id, topic_id, timestamp, data) AS {endless}"),
+            "\"Messages\" is no plain table",
+        ),
+        (
+            table.replace(" BLOB", " AS (zeroblob(500000000)))") + "; INSERT INTO messages VALUES (1, 1, 1)",
+            "\"messages\" is no plain table",
+        ),
+        (
+            format!("{table}); INSERT INTO messages VALUES (1, 1, 1, zeroblob(65 << 20))"),
+            "1 message cannot be read: string or blob too big",
+        ),
+    ] {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        Connection::open(file.path()).unwrap().execute_batch(&format!("{topics} {messages}")).unwrap();
+        let refused = match McapReader::open(file.path()) {
+            Err(error) => error.to_string(),
+            Ok(mut reader) => {
+                assert_eq!(reader.by_ref().count(), 0);
+                reader.incomplete().expect("it is named")
+            }
+        };
+        assert!(refused.contains(named), "{refused}");
+    }
+}
+
+#[test]
+fn a_file_that_decompresses_to_far_more_than_it_has_is_read_up_to_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let zeros = vec![0; 40 << 20];
+    let mcap = folder.path().join("bomb.mcap");
+    let options = WriteOptions::new().compression(Some(mcap::Compression::Zstd)).compression_threads(0);
+    let mut writer = options.create(std::fs::File::create(&mcap).unwrap()).unwrap();
+    let channel = writer.add_channel(0, "/points", "", &Default::default()).unwrap();
+    let bag = folder.path().join("bomb.db3");
+    let tables = "CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+        CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+        INSERT INTO topics VALUES (1, '/points', '', '');";
+    let messages = Connection::open(&bag).unwrap();
+    messages.execute_batch(tables).unwrap();
+    let frame = zstd::bulk::compress(&zeros, 1).unwrap();
+    for time in 1..=3_u32 {
+        let header = mcap::records::MessageHeader {
+            channel_id: channel,
+            sequence: time,
+            log_time: time.into(),
+            publish_time: time.into(),
+        };
+        writer.write_to_known_channel(&header, &zeros).unwrap();
+        messages.execute("INSERT INTO messages VALUES (?1, 1, ?1, ?2)", (time, &frame)).unwrap();
+    }
+    writer.finish().unwrap();
+    for file in [&mcap, &bag] {
+        let mut reader = McapReader::open(file).unwrap();
+        assert_eq!(reader.by_ref().count(), 1, "{}", file.display());
+        let incomplete = reader.incomplete().expect("the rest is named");
+        assert!(incomplete.contains("decompresses to far too much"), "{incomplete}");
+    }
+}

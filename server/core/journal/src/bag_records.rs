@@ -1,5 +1,6 @@
 //! A ROS 2 bag in sqlite (`.db3`) -> the records that an MCAP file of the same messages would have, in the order of
-//! their times. Nothing is written beside the bag: where SQLite would, it reads a copy.
+//! their times. Nothing is written beside the bag: where SQLite would, it reads a copy. A bag is a file of others: only
+//! plain tables are read, of values and in queries that are limited.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;
@@ -7,15 +8,24 @@ use std::io::{Error, Read};
 use std::path::{Path, PathBuf};
 
 use mcap::records::{Channel, MessageHeader, Record, SchemaHeader};
-use rusqlite::{Connection, OpenFlags, params};
+use rusqlite::limits::Limit;
+use rusqlite::{Connection, Error as SqlError, OpenFlags, OptionalExtension, params};
 use tempfile::TempDir;
 
-use super::chunk::RECORD_BYTES_MAX;
+use super::chunk::{RECORD_BYTES_MAX, may_decompress};
 use super::damage::LostPart;
 use crate::counted::counted;
 
 /// Number of messages that are read at once. Ours: a message of points has about a megabyte.
 const BATCH: i64 = 16;
+/// Number of bytes of messages after which no more are read at once.
+const BATCH_BYTES: usize = 16 << 20;
+/// Most steps of a query in SQLite's machine. Ours: the sixteen messages of a batch take 500, and with an index of the
+/// times each query does; without it, 10 for each message of the bag.
+const QUERY_STEPS_MAX: i32 = 1_000_000_000;
+/// The first of the two tables that is a view, of a module, or has columns that are computed when they are read.
+const NOT_PLAIN: &str = "SELECT name FROM pragma_table_list AS listed WHERE lower(name) IN ('topics', 'messages') AND \
+    (type <> 'table' OR EXISTS (SELECT 1 FROM pragma_table_xinfo(listed.name) WHERE hidden > 0))";
 /// First bytes of a message that rosbag2 has compressed with zstd. No message in CDR starts with them.
 const ZSTD: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
 
@@ -28,6 +38,8 @@ pub(super) struct BagRecords {
     /// Time and id of the newest message.
     newest: (i64, i64),
     bytes_read: u64,
+    /// Bytes of the messages so far, decompressed.
+    decompressed: u64,
     has_ended: bool,
     lost: Vec<LostPart>,
 }
@@ -46,13 +58,18 @@ impl BagRecords {
         };
         let (file, copy, is_unchanging) = readable(file).map_err(copied)?;
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-        let bag = match is_unchanging {
+        let mut bag = match is_unchanging {
             true => {
                 let uri = format!("file:{}?immutable=1", percent_encoded(&file));
                 Connection::open_with_flags(uri, flags | OpenFlags::SQLITE_OPEN_URI)?
             }
             false => Connection::open_with_flags(&file, flags)?,
         };
+        bag.set_limit(Limit::SQLITE_LIMIT_LENGTH, RECORD_BYTES_MAX as i32)?;
+        bag.progress_handler(QUERY_STEPS_MAX, Some(|| true))?;
+        if let Some(name) = bag.query_row(NOT_PLAIN, [], |row| row.get::<_, String>(0)).optional()? {
+            return Err(refused(format!("{name:?} is no plain table")));
+        }
         let mut waiting = VecDeque::new();
         let mut topics = bag.prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")?;
         let mut rows = topics.query([])?;
@@ -67,7 +84,8 @@ impl BagRecords {
         drop(rows);
         drop(topics);
         let newest = (i64::MIN, i64::MIN);
-        Ok(Self { bag, _copy: copy, waiting, newest, bytes_read: 0, has_ended: false, lost: Vec::new() })
+        let (bytes_read, decompressed) = (0, 0);
+        Ok(Self { bag, _copy: copy, waiting, newest, bytes_read, decompressed, has_ended: false, lost: Vec::new() })
     }
 
     /// Number of bytes of the messages so far.
@@ -94,7 +112,9 @@ impl BagRecords {
             // The pages of a table hang on each other: what follows a damaged page cannot be found.
             self.has_ended = true;
             let left = self.messages_left().map_or(String::new(), |left| format!("{} ", counted(left, "message")));
-            let reason = format!("{left}after the time {} cannot be read: {error}", self.newest.0);
+            let after =
+                if self.newest.0 > i64::MIN { format!("after the time {} ", self.newest.0) } else { String::new() };
+            let reason = format!("{left}{after}cannot be read: {error}");
             let bytes = (self.bytes_read, self.bytes_read);
             self.lost.push(LostPart::new(bytes, reason, true));
         }
@@ -115,11 +135,19 @@ impl BagRecords {
         )?;
         let mut rows = messages.query(params![self.newest.0, self.newest.1, BATCH])?;
         self.has_ended = true;
-        while let Some(row) = rows.next()? {
+        let mut bytes = 0;
+        while bytes < BATCH_BYTES
+            && let Some(row) = rows.next()?
+        {
             let (id, channel_id, time): (i64, u16, i64) = (row.get(0)?, row.get(1)?, row.get(2)?);
             let data: Vec<u8> = row.get(3)?;
             self.bytes_read += data.len() as u64;
             let data = if data.starts_with(ZSTD) { decompressed(&data)? } else { data };
+            self.decompressed += data.len() as u64;
+            if !may_decompress(self.decompressed, self.bytes_read) {
+                return Err(refused("the bag decompresses to far too much".into()));
+            }
+            bytes += data.len();
             let log_time = u64::try_from(time).unwrap_or(0);
             let header = MessageHeader { channel_id, sequence: 0, log_time, publish_time: log_time };
             self.waiting.push_back(Record::Message { header, data: data.into() });
@@ -163,9 +191,16 @@ fn percent_encoded(path: &Path) -> String {
 
 fn decompressed(data: &[u8]) -> rusqlite::Result<Vec<u8>> {
     let mut content = Vec::new();
-    let frame = zstd::stream::read::Decoder::new(data).map(|frame| frame.take(RECORD_BYTES_MAX as u64));
-    frame
-        .and_then(|mut frame| frame.read_to_end(&mut content))
-        .map_err(|error| rusqlite::Error::FromSqlConversionFailure(3, rusqlite::types::Type::Blob, Box::new(error)))?;
+    let frame = zstd::stream::read::Decoder::new(data).map(|frame| frame.take(RECORD_BYTES_MAX as u64 + 1));
+    frame.and_then(|mut frame| frame.read_to_end(&mut content)).map_err(|error| refused(error.to_string()))?;
+    if content.len() > RECORD_BYTES_MAX {
+        return Err(refused(format!("a message decompresses to more than the {RECORD_BYTES_MAX} bytes that are read")));
+    }
     Ok(content)
+}
+
+/// An error for a bag that SQLite reads and this reader does not.
+fn refused(reason: String) -> SqlError {
+    let code = rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_CORRUPT);
+    SqlError::SqliteFailure(code, Some(reason))
 }

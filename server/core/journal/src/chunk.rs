@@ -10,9 +10,13 @@ use std::io::Read;
 use mcap::records::{ChunkHeader, MessageIndexEntry, Record, op};
 use mcap::{McapError, parse_record};
 
-/// Greatest length of a record, and of a decompressed chunk, in bytes. Ours: our chunks have a few MiB; a greater
-/// length is damage, refused before it is allocated.
-pub(super) const RECORD_BYTES_MAX: usize = 256 << 20;
+/// Greatest length of a record, and of a decompressed chunk or message, in bytes. Ours: our chunks have a few MiB, a
+/// cloud or an image less than 40; a greater length is damage, refused before it is allocated. A reader holds up to
+/// four times as much.
+pub(super) const RECORD_BYTES_MAX: usize = 64 << 20;
+/// Most bytes that a file may decompress to for each of its bytes, beside [`RECORD_BYTES_MAX`]. Ours: recorded drives
+/// have 2 to 20.
+const COMPRESSION_MAX: u64 = 200;
 /// Length of the head of a record: its kind (one byte) and its length (eight bytes).
 pub(super) const RECORD_HEAD_BYTES: usize = 9;
 /// Length of the fields of a chunk before its data, without the name of its compression.
@@ -20,10 +24,25 @@ const CHUNK_FIELDS_BYTES: usize = 40;
 /// Length of the head of a message, its channel (two bytes), its sequence number (four) and its log time (eight).
 const MESSAGE_START_BYTES: usize = RECORD_HEAD_BYTES + 14;
 
-/// Decompresses a chunk and checks its length and, if it has one, its CRC.
-pub(super) fn decompress<'a>(header: &ChunkHeader, data: &'a [u8]) -> Result<Cow<'a, [u8]>, McapError> {
+/// True if the first `file_bytes` of a file may decompress to so many bytes: a small file does not keep a command busy
+/// for minutes.
+pub(super) fn may_decompress(bytes: u64, file_bytes: u64) -> bool {
+    bytes <= (RECORD_BYTES_MAX as u64).saturating_add(COMPRESSION_MAX.saturating_mul(file_bytes))
+}
+
+/// Decompresses a chunk and checks its length and, if it has one, its CRC. `before`: bytes of the chunks before it,
+/// decompressed; `end`: position of its end in the file.
+pub(super) fn decompress<'a>(
+    header: &ChunkHeader,
+    data: &'a [u8],
+    before: u64,
+    end: u64,
+) -> Result<Cow<'a, [u8]>, McapError> {
     let size = usize::try_from(header.uncompressed_size).ok().filter(|size| *size <= RECORD_BYTES_MAX);
     let size = size.ok_or(McapError::ChunkTooLarge(header.uncompressed_size))?;
+    if !may_decompress(before + size as u64, end) {
+        return Err(McapError::DecompressionError("the file decompresses to far too much".into()));
+    }
     let content = match &*header.compression {
         "" => Cow::Borrowed(data),
         "zstd" => zstd::bulk::decompress(data, size)
@@ -129,7 +148,7 @@ mod tests {
         let mut encoder = lz4_flex::frame::FrameEncoder::new(Vec::new());
         encoder.write_all(&content).unwrap();
         let data = encoder.finish().unwrap();
-        let decompress = |size, crc| decompress(&header("lz4", size, crc), &data).map(Cow::into_owned);
+        let decompress = |size, crc| decompress(&header("lz4", size, crc), &data, 0, 0).map(Cow::into_owned);
         assert_eq!(decompress(5000, crc32fast::hash(&content)).unwrap(), content);
         assert!(matches!(decompress(5000, 1), Err(McapError::BadChunkCrc { .. })));
         for size in [0, 4999, 5001] {
@@ -141,8 +160,8 @@ mod tests {
     #[test]
     fn bytes_that_are_not_an_lz4_frame_are_damage() {
         for data in [&b""[..], b"abcdefgh", &[0x04, 0x22, 0x4d, 0x18, 0xff, 0xff, 0xff, 0xff, 0xff]] {
-            assert!(decompress(&header("lz4", 10, 0), data).is_err(), "{data:?}");
+            assert!(decompress(&header("lz4", 10, 0), data, 0, 0).is_err(), "{data:?}");
         }
-        assert!(matches!(decompress(&header("lzma", 10, 0), b""), Err(McapError::UnsupportedCompression(_))));
+        assert!(matches!(decompress(&header("lzma", 10, 0), b"", 0, 0), Err(McapError::UnsupportedCompression(_))));
     }
 }

@@ -87,6 +87,8 @@ pub(super) struct McapRecords {
     section: Section,
     summary: McapSummary,
     chunk: OpenChunk,
+    /// Bytes of the chunks so far, decompressed.
+    decompressed: u64,
     /// CRC of the section so far.
     crc: Hasher,
     /// Number of lost parts of the data section.
@@ -114,6 +116,7 @@ impl McapRecords {
             section: Section::Data,
             summary,
             chunk: OpenChunk::default(),
+            decompressed: 0,
             crc: Hasher::new(),
             lost_data: 0,
             wrong_indexes: Vec::new(),
@@ -220,8 +223,9 @@ impl McapRecords {
             }
         };
         match record {
-            Record::Chunk { header, data } => match decompress(&header, &data) {
+            Record::Chunk { header, data } => match decompress(&header, &data, self.decompressed, end) {
                 Ok(content) => {
+                    self.decompressed += content.len() as u64;
                     let content = content.into_owned();
                     self.chunk = OpenChunk { content, at: 0, bytes: (from, end), lost_from: None };
                     self.pass(opcode, &body, end);
