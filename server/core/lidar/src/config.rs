@@ -2,7 +2,8 @@
 
 use crate::calibration::Calibration;
 use crate::model::Model;
-use crate::time::clock::{AHEAD_NS_MAX, GPS_LATE_NS_MAX};
+use crate::time::clock::AHEAD_NS_MAX;
+use crate::time::gps::GPS_LATE_NS_MAX;
 
 /// Properties of a sensor that are known before its first datagram. The default finds everything in the data and cuts
 /// revolutions at azimuth 180 degrees, behind the vehicle.

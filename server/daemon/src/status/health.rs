@@ -313,8 +313,8 @@ fn sensor_findings(sensor: &SensorFacts, validity: Duration, add: &mut impl FnMu
     if sensor.clock == "holdover" || sensor.clock == "gps_unlocked" {
         add(State::Warn, format!("the clock of {name} is {}", sensor.clock));
     }
-    // Beyond it maps are stale when they are made, or of the future.
-    if !validity.is_zero() && u128::from(sensor.clock_offset_ms.unsigned_abs()) > validity.as_millis() {
+    // Beyond half of it maps may be stale when they are made, or of the future.
+    if !validity.is_zero() && u128::from(sensor.clock_offset_ms.unsigned_abs()) > validity.as_millis() / 2 {
         let offset_s = sensor.clock_offset_ms as f64 / 1e3;
         add(State::Warn, format!("the host's clock is {offset_s:+.1} s ahead of that of {name}"));
     }

@@ -253,8 +253,11 @@ impl Decoder {
     /// Number of packets from the one that began at azimuth `before` to this one, from the angle between them.
     fn packets_since(&self, before: Option<u32>, packet: &Packet<'_>) -> i64 {
         let turned = before.map_or(0, |before| forward(before, packet.azimuth(0)));
-        let step = self.spec.firing_step(self.mode, self.rpm()).max(1);
-        let span = step * self.spec.firings_per_packet(self.mode) as u32;
+        let by_rate =
+            self.spec.firing_step(self.mode, self.rpm()).max(1) * self.spec.firings_per_packet(self.mode) as u32;
+        // Without device time the rate follows from these steps: a wrong one would confirm itself.
+        let is_wrong = self.span() > 0 && self.span().abs_diff(by_rate) > by_rate / 4;
+        let span = if is_wrong { self.span() } else { by_rate };
         if turned > FORWARD_MAX { 1 } else { i64::from((turned + span / 2) / span).max(1) }
     }
 
@@ -267,7 +270,7 @@ impl Decoder {
         self.step.unwrap_or(0) / self.spec.firings_per_block as u32
     }
 
-    /// Counts from packet to packet.
+    /// Counts from packet to packet, as the blocks of the newest packet show it.
     fn span(&self) -> u32 {
         self.firing_step() * self.spec.firings_per_packet(self.mode) as u32
     }

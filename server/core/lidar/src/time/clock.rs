@@ -33,13 +33,14 @@
 //! | valid GPRMC, pulse locked | - | `gps` | `gps` | `gps` if within reach |
 //! | valid GPRMC, pulse not locked | `gps_unlocked` | - | `gps_unlocked` | `gps_unlocked` if within reach |
 //! | GPRMC invalid; telemetry silent for 3 s; device counter jumps | `gps_unlocked` | - | - | - |
+//! | no valid GPRMC for 3 s, and the last ones agreed for less than 0.5 s or are ahead of arrival | new offset | new offset | - | - |
 //! | device counter jumps, and arrival differs by 10 to 500 ms | `gps_unlocked` | - | new offset | new offset |
 //! | least delay rises by more than 500 ms | - | - | new offset | new offset |
 //! | least delay rises by more than 500 ms, in a burst | - | - | - | - |
 //! | least delay falls by more than 500 ms | - | - | `holdover` | - |
 //! | 0.35 s agree on a delay less by 100 ms (`device`: 250 ms) | - | - | new offset | new offset |
-//! | 0.35 s agree on a delay more by 100 ms, not in a burst (`device`: -) | - | - | new offset | new offset |
-//! | ten seconds agree on another delay, by 10 ms (`device`: 500 ms) | - | - | new offset | new offset |
+//! | 0.35 s agree on a delay more by 100 ms, not in a burst (`device`: 5 s, 250 ms) | - | - | new offset | new offset |
+//! | ten seconds agree on another delay, by 10 ms (`device`: 250 ms) | - | - | new offset | new offset |
 //! | the stamps reach the offset again | - | - | - | state of that offset |
 //!
 //! "New offset" leads to `device` or `arrival`, as in the first table. Between these events arrivals change no stamp.
@@ -53,12 +54,14 @@
 //!   sent, so the host's clock is wrong. A GPRMC that is later by more has a wrong date, unless the host's clock was
 //!   never set: it then shows a time before the first of these sensors.
 //! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays
-//!   in force if GPS or the pulse is lost, over a restart, and if the host disagrees. If it is not within reach, the
-//!   stamps go on by arrival.
+//!   in force if GPS or the pulse is lost, over a restart, and if the host is ahead of it. If it is not within reach,
+//!   the stamps go on by arrival. So do they if GPS is lost and nothing vouches for its hour or its date: its sentences
+//!   agreed for less than half a second, or it is ahead of the host by more than `ahead_ns_max`, so that no reader there
+//!   can use a map.
 //! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set forward.
 //!   If the packets come faster than they were sent, they have waited (a receiver that stood still, a network): then
 //!   the rise is an age and no offset, and the stamps must show it. A rise that stays cannot be told from a clock that
-//!   was set; if the device's minutes agree with UTC, they decide.
+//!   was set; if the device's minutes agree with UTC, they decide for five seconds.
 //! - A delay that stays less than the offset means that the host's clock was set back, or that the offset came from
 //!   packets that had waited. While the delay goes on falling (a capture that is sent too fast, a burst), there is no
 //!   clock to follow.
@@ -71,24 +74,11 @@
 //! - If `ahead_ns_max` is 0, no epoch begins: for a clock that is at most 60 s behind, the stamps run at half speed,
 //!   and no other is followed. Recordings made before there were epochs are replayed so.
 
+use super::gps::{EARLIEST_NS, Gps, device_utc_ns, gps_ahead_ns, is_plausible};
 use super::minimum_delay::{MinimumDelay, STEP_NS_MAX};
-use super::timeline::{NS_PER_HOUR, NS_PER_SECOND, StepKind, Timeline, nearest_hour};
+use super::timeline::{NS_PER_SECOND, StepKind, Timeline};
 use crate::datagram::telemetry::{Pps, Telemetry};
 
-/// Age of a GPRMC on the device's clock, in ns. A GPRMC names the second that has passed and is repeated until the next
-/// one: it is 0.85 to 1.85 s old in the recorded drives of an HDL-32E and 1.1 to 1.5 s in those of a VLP-16. A device
-/// whose time differs by more was not set by this receiver.
-const GPRMC_AGE_NS: std::ops::RangeInclusive<i64> = -500_000_000..=2_900_000_000;
-/// Time without telemetry, in ns, after which GPS is lost. Sensors send telemetry many times per second.
-const GPS_SILENCE_NS_MAX: i64 = 3 * NS_PER_SECOND;
-/// 1 January 2005, in ns since the Unix epoch: none of these sensors is older. A receiver without a fix sends 1980.
-const EARLIEST_NS: i64 = 1_104_537_600 * NS_PER_SECOND;
-/// Default of [`crate::SensorConfig::gps_late_ns_max`], in ns: 24 hours. The clock of a host may be wrong by hours
-/// (time zone, battery) but not by days, while the error of a receiver is 1024 weeks.
-pub const GPS_LATE_NS_MAX: i64 = 24 * NS_PER_HOUR;
-/// Time, in ns, by which the limit of GPS time ahead of arrival is less than the limit behind. Ours: a receiver with
-/// the date of tomorrow is then beyond it, and a host whose time zone is wrong is within it.
-const GPS_AHEAD_LESS_NS: i64 = 6 * NS_PER_HOUR;
 /// Latest arrival, in ns since the Unix epoch: the year 2096. Later arrivals are replaced by it, because stamps near
 /// the end of 64 bits would overflow.
 const ARRIVAL_NS_MAX: i64 = 4_000_000_000 * NS_PER_SECOND;
@@ -110,6 +100,10 @@ const EPOCH_NS_MIN: i64 = NS_PER_SECOND;
 /// Change of the delay, in ns, that is followed as soon as revolutions agree on it. Ours: a smaller one is drift, for
 /// which ten seconds are soon enough.
 const CHANGE_NS_MIN: i64 = 100_000_000;
+
+/// Time, in ns, after which a delay that has risen is that of a host whose clock was set, although the device's minutes
+/// agree with UTC. Ours: packets that wait for so long on their way do not all wait for the same time.
+const RISE_NS: i64 = 5 * NS_PER_SECOND;
 
 /// The clock that the stamps of a revolution follow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -191,15 +185,6 @@ pub(crate) struct DeviceClock {
     epoch_began_ns: Option<i64>,
 }
 
-/// The newest valid GPRMC.
-#[derive(Clone, Copy, Debug)]
-struct Gps {
-    offset_ns: i64,
-    /// Time of the telemetry on the timeline.
-    received_ns: i64,
-    locked: bool,
-}
-
 /// A valid GPRMC whose device time is not on the timeline yet.
 #[derive(Clone, Copy, Debug)]
 struct PendingGps {
@@ -223,7 +208,7 @@ impl DeviceClock {
         };
         let is_set = arrival_ns >= EARLIEST_NS;
         let ahead_ns = gps_ahead_ns(telemetry, arrival_ns);
-        self.gps_ahead_ns = ahead_ns.filter(|ahead_ns| !self.is_plausible(*ahead_ns, is_set));
+        self.gps_ahead_ns = ahead_ns.filter(|ahead_ns| !is_plausible(*ahead_ns, is_set, self.gps_late_ns_max));
         let Some(utc_ns) = device_utc_ns(telemetry).filter(|_| self.gps_ahead_ns.is_none()) else {
             self.gps.iter_mut().for_each(|gps| gps.locked = false);
             return;
@@ -237,17 +222,11 @@ impl DeviceClock {
         self.gps_ahead_ns
     }
 
-    /// True if GPS time may be ahead of its arrival by this time; `is_set`: the host's clock was set.
-    fn is_plausible(&self, ahead_ns: i64, is_set: bool) -> bool {
-        let ahead_ns_max = if is_set { (self.gps_late_ns_max - GPS_AHEAD_LESS_NS).max(0) } else { i64::MAX };
-        (-self.gps_late_ns_max..=ahead_ns_max).contains(&ahead_ns)
-    }
-
     /// Applies the pending GPRMC if its device time is on the timeline now.
     fn apply_pending(&mut self) {
         let Some(PendingGps { device_us, utc_ns, locked }) = self.pending else { return };
         if let Some(received_ns) = self.timeline.time_at(device_us) {
-            self.gps = Some(Gps { offset_ns: utc_ns - received_ns, received_ns, locked });
+            self.gps = Some(Gps::new(utc_ns - received_ns, received_ns, locked, self.gps));
             self.pending = None;
         }
     }
@@ -317,11 +296,14 @@ impl DeviceClock {
 
     /// Chooses the offset of a revolution, and the clock that it follows.
     fn choose(&mut self, first_ns: i64, delay_ns: Option<i64>) -> (i64, Clock) {
+        if self.ahead_ns_max > 0 && self.gps.is_some_and(|gps| gps.is_doubtful(first_ns, delay_ns, self.ahead_ns_max)) {
+            (self.gps, self.offset) = (None, None);
+        }
         let newest_ns = self.newest.map(|newest| newest.end_ns);
         let is_ahead = |offset_ns: i64, ns_max: i64| newest_ns.is_some_and(|ns| ns - (offset_ns + first_ns) > ns_max);
         let wanted = match self.gps.filter(|gps| !is_ahead(gps.offset_ns, REACH_NS_MAX)) {
             Some(gps) => {
-                let lost = !gps.locked || first_ns - gps.received_ns > GPS_SILENCE_NS_MAX;
+                let lost = !gps.locked || gps.is_silent(first_ns);
                 Some((gps.offset_ns, if lost { Clock::GpsUnlocked } else { Clock::Gps }))
             }
             None => self.choose_by_arrival(first_ns, delay_ns),
@@ -350,17 +332,17 @@ impl DeviceClock {
         {
             return Some(self.offset_by_arrival(delay_ns));
         }
-        let (fall_ns_min, rise_ns_min) = match clock {
-            Clock::Arrival if is_burst => (CHANGE_NS_MIN, i64::MAX),
-            Clock::Arrival => (CHANGE_NS_MIN, CHANGE_NS_MIN),
-            _ => (HOUR_ERROR_NS_MAX, i64::MAX),
+        let (change_ns_min, rises_for_ns) = match clock {
+            Clock::Arrival => (CHANGE_NS_MIN, if is_burst { i64::MAX } else { 0 }),
+            _ => (HOUR_ERROR_NS_MAX, RISE_NS),
         };
-        if let Some(agreed_ns) = self.minimum_delay.agreed(first_ns).filter(|_| has_epochs)
-            && (offset_ns - agreed_ns > fall_ns_min || agreed_ns - offset_ns > rise_ns_min)
+        if let Some((agreed_ns, for_ns)) = self.minimum_delay.agreed(first_ns).filter(|_| has_epochs)
+            && (offset_ns - agreed_ns > change_ns_min
+                || agreed_ns - offset_ns > change_ns_min && for_ns >= rises_for_ns)
         {
             return Some(self.offset_by_arrival(agreed_ns));
         }
-        let bound_ns = if clock == Clock::Arrival { DRIFT_NS_MAX } else { STEP_NS_MAX };
+        let bound_ns = if clock == Clock::Arrival { DRIFT_NS_MAX } else { HOUR_ERROR_NS_MAX };
         if let Some(agreed_ns) = self.minimum_delay.end_window(first_ns)
             && agreed_ns.abs_diff(offset_ns) > bound_ns as u64
         {
@@ -370,24 +352,11 @@ impl DeviceClock {
     }
 
     /// The offset of whole hours if it is near the offset by arrival, else the latter.
-    fn offset_by_arrival(&self, arrival_offset_ns: i64) -> (i64, Clock) {
+    fn offset_by_arrival(&mut self, arrival_offset_ns: i64) -> (i64, Clock) {
+        self.minimum_delay.restart_window();
         match self.timeline.zero_by_hour_ns(arrival_offset_ns) {
             Some(hours_ns) if (hours_ns - arrival_offset_ns).abs() <= HOUR_ERROR_NS_MAX => (hours_ns, Clock::Device),
             _ => (arrival_offset_ns, Clock::Arrival),
         }
     }
-}
-
-/// Time by which the GPRMC of the telemetry is ahead of its arrival; `None` without a valid one.
-fn gps_ahead_ns(telemetry: &Telemetry, arrival_ns: i64) -> Option<i64> {
-    let gprmc = telemetry.gprmc.as_ref().filter(|gprmc| gprmc.valid)?;
-    let utc_ns = gprmc.utc_ns.filter(|utc_ns| *utc_ns >= EARLIEST_NS)?;
-    Some(utc_ns.saturating_sub(arrival_ns))
-}
-
-/// UTC at which the device's clock showed the time of the telemetry; `None` if its GPRMC is not valid.
-fn device_utc_ns(telemetry: &Telemetry) -> Option<i64> {
-    let utc_ns = gps_ahead_ns(telemetry, 0)?;
-    let age_ns = nearest_hour(i64::from(telemetry.device_us) * 1_000 - utc_ns, 0);
-    GPRMC_AGE_NS.contains(&age_ns).then_some(utc_ns + age_ns)
 }

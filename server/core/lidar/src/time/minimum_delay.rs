@@ -90,9 +90,16 @@ impl MinimumDelay {
         (window.greatest_ns - window.least_ns <= STEP_NS_MAX).then_some(window.least_ns)
     }
 
-    /// Least delay of the newest revolutions if they have agreed for long enough at `first_ns` on the timeline.
-    pub fn agreed(&self, first_ns: i64) -> Option<i64> {
-        self.agreed.filter(|agreed| first_ns - agreed.start_ns >= AGREED_NS).map(|agreed| agreed.least_ns)
+    /// Begins the window of drift with the next revolution, because the delays before belong to another offset.
+    pub fn restart_window(&mut self) {
+        self.window = None;
+    }
+
+    /// Least delay of the newest revolutions and the time for which they have agreed at `first_ns` on the timeline, if
+    /// that is long enough.
+    pub fn agreed(&self, first_ns: i64) -> Option<(i64, i64)> {
+        let agreed = self.agreed.map(|agreed| (agreed.least_ns, first_ns - agreed.start_ns));
+        agreed.filter(|(_, for_ns)| *for_ns >= AGREED_NS)
     }
 
     /// True if the packets of the newest revolution arrived in a burst: they waited before they were received, so

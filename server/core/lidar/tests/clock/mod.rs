@@ -1,6 +1,7 @@
 //! Stamps: they rise within an epoch, and after an event of any clock they are right again one revolution later, or
 //! half a second later if they must go back.
 
+mod drawn;
 mod scripts;
 
 use clearway_lidar::{Clock, DatagramError, Model, Revolution, Sensor, SensorConfig};

@@ -39,7 +39,7 @@ fn nothing_is_wrong_with_fresh_maps_of_whole_scans() {
 #[test]
 fn each_thing_that_is_wrong_has_its_words() {
     type Change = fn(&mut Facts);
-    let cases: [(&str, &str, Change); 22] = [
+    let cases: [(&str, &str, Change); 23] = [
         ("error", "the engine has hung for 4 s", |f| f.fault = Some("the engine has hung for 4 s".into())),
         ("warn", "no packets from rear for 76 s", |f| f.sensors[1].silent = Some(ms(76_000))),
         ("warn", "no packets from rear since the server started 60 s ago", |f| f.sensors[1].silent = None),
@@ -78,6 +78,7 @@ fn each_thing_that_is_wrong_has_its_words() {
             |f| f.sensors[0].packets = Some([181, 76]),
         ),
         ("warn", "the host's clock is +0.9 s ahead of that of top", |f| f.sensors[0].clock_offset_ms = 900),
+        ("warn", "the host's clock is -0.2 s ahead of that of top", |f| f.sensors[0].clock_offset_ms = -200),
         ("warn", "the clock of top is holdover", |f| f.sensors[0].clock = "holdover".into()),
         ("warn", "4.2 % of the packets of the last 10 s were lost or refused", |f| f.loss = 0.042),
         ("warn", "1 part not yet in the store: no", |f| {
