@@ -15,6 +15,33 @@ pub struct ReplayClock {
     anchor: Option<Anchor>,
     /// Recorded time from which it goes on; `None`: that of the next event.
     begins_ns: Option<i64>,
+    lag: StampLag,
+}
+
+/// Time by which the stamps of a drive are behind the arrivals of its events, in ns, because its sensor followed
+/// another clock than its host. It is followed in whole [`LAG_STEP_NS`], as soon as it is less, and after
+/// [`LATE_MAPS_MAX`] maps if it is more: maps that were late on the way of the drive are late as live too.
+#[derive(Debug, Default)]
+struct StampLag {
+    ns: Option<i64>,
+    late_maps: u32,
+}
+
+/// Smallest lag that is followed, in ns. Ours: a third of the validity of a map.
+const LAG_STEP_NS: i64 = 100_000_000;
+/// Number of maps in a row after which a greater lag is that of a clock. Ours: one second.
+const LATE_MAPS_MAX: u32 = 10;
+
+impl StampLag {
+    /// Adds the lag of a map.
+    fn add(&mut self, map_ns: i64) {
+        let steps_ns = if map_ns.abs() < LAG_STEP_NS { 0 } else { map_ns.div_euclid(LAG_STEP_NS) * LAG_STEP_NS };
+        let is_late = self.ns.is_some_and(|ns| steps_ns > ns);
+        self.late_maps = if is_late { self.late_maps + 1 } else { 0 };
+        if !is_late || self.late_maps >= LATE_MAPS_MAX {
+            (self.ns, self.late_maps) = (Some(steps_ns), 0);
+        }
+    }
 }
 
 /// An event's recorded time, and the time at which it was replayed by both clocks of this machine.
@@ -28,7 +55,7 @@ struct Anchor {
 impl ReplayClock {
     /// A clock that runs at `rate` times recorded time.
     pub fn new(rate: f64) -> Self {
-        Self { rate, anchor: None, begins_ns: None }
+        Self { rate, anchor: None, begins_ns: None, lag: StampLag::default() }
     }
 
     /// Runs at `rate` from the next event on.
@@ -65,9 +92,18 @@ impl ReplayClock {
         anchor.steady.checked_add(after)
     }
 
-    /// The header that a map of the recorded time `at_ns` is served with; `None` for that of the recorded map.
+    /// Notes that the event of the recorded time `at_ns` has made a map whose capture ended at `capture_end_ns`.
+    pub fn note_map(&mut self, at_ns: i64, capture_end_ns: i64) {
+        self.lag.add(at_ns.saturating_sub(capture_end_ns));
+    }
+
+    /// The header that a map of the recorded time `at_ns` is served with; `None` for that of the recorded map. As live
+    /// its stamps follow this machine's clock, also if those of the drive are behind its arrivals.
     pub fn replayed(&self, state: &v1::ReplayState, boot_id: u64, at_ns: i64, wall_ns: i64) -> Option<Replayed> {
-        let shift_ns = if state.as_live { self.shift_ns(at_ns, wall_ns) } else { 0 };
+        let shift_ns = match state.as_live {
+            true => self.shift_ns(at_ns, wall_ns).saturating_add(self.lag.ns.unwrap_or(0)),
+            false => 0,
+        };
         let boot_id = boot_id.wrapping_add(state.jumps);
         (state.as_live || state.jumps > 0).then_some(Replayed { shift_ns, boot_id })
     }
@@ -99,6 +135,24 @@ mod tests {
         for recorded_ns in [5_000_000_000, 5_000_000_001, 9_123_456_789] {
             assert_eq!(clock.shift_ns(recorded_ns, 42), 1_000 - 5_000_000_000);
         }
+    }
+
+    #[test]
+    fn maps_of_a_drive_whose_sensor_is_behind_its_host_are_fresh_as_live() {
+        const MS: i64 = 1_000_000;
+        let (mut clock, state) = (ReplayClock::new(1.0), v1::ReplayState { as_live: true, ..Default::default() });
+        let mut map = |at: i64, behind: i64| {
+            clock.due(at * MS, 0);
+            let shift_ns = clock.replayed(&state, 0, at * MS, 0).expect("stamps of its own").shift_ns;
+            clock.note_map(at * MS, (at - behind) * MS);
+            // The drive began at 1000 ms, which is 0 of this machine.
+            (at - 1_000) - ((at - behind) + shift_ns / MS)
+        };
+        assert_eq!(map(1_000, 950), 950, "nothing is known before the first map");
+        assert_eq!([map(1_100, 955), map(1_200, 930), map(1_300, 1_400)], [55, 30, 500], "one map was late");
+        assert_eq!([map(1_400, -450), map(1_500, -450)], [-1_350, 50], "stamps of the future are followed at once");
+        let ages: Vec<_> = (0..12).map(|n| map(1_600 + 100 * n, 20)).collect();
+        assert_eq!((ages[9], ages[10]), (520, 20), "a clock that was set is followed after a second: {ages:?}");
     }
 
     #[test]

@@ -274,7 +274,7 @@ impl Player {
     /// one was made of that vehicle.
     fn step_waiting(&mut self, vehicle: Option<usize>) -> Option<u64> {
         let now_ns = now_ns();
-        let (clock, state, boot_id) = (&self.clock, &self.state, self.options.boot_id);
+        let (clock, state, boot_id) = (&mut self.clock, &self.state, self.options.boot_id);
         let vehicles = self.vehicles.iter_mut().enumerate();
         let mut made = None;
         for (_, ReplayedVehicle { engine, events, .. }) in vehicles.filter(|(i, _)| vehicle.is_none_or(|v| v == *i)) {
@@ -287,7 +287,9 @@ impl Player {
             if vehicle.is_none() {
                 engine.update_status();
             }
-            made = (engine.maps() > before).then(|| engine.maps() - 1);
+            let newest = engine.pipeline.newest_map().filter(|map| map.sequence >= before);
+            newest.iter().for_each(|map| clock.note_map(state.position_ns, map.capture_end_ns));
+            made = newest.map(|map| map.sequence);
         }
         made
     }
