@@ -1,5 +1,5 @@
 """Reads an MCAP file with the schemas that the file holds, and prints its topics as one JSON object, each with its
-schema, its number of messages and its last message.
+schema, its metadata, its number of messages and its last message.
 
 Usage: viewer_file.py FILE
 """
@@ -27,7 +27,8 @@ def main(file):
     with open(file, "rb") as stream:
         reader = make_reader(stream, decoder_factories=[Protobuf(), Ros2()])
         for schema, channel, message, decoded in reader.iter_decoded_messages():
-            topic = topics.setdefault(channel.topic, {"schema": schema.name, "count": 0})
+            known = {"schema": schema.name, "metadata": channel.metadata, "count": 0}
+            topic = topics.setdefault(channel.topic, known)
             topic["count"] += 1
             topic["log_ns"] = message.log_time
             topic["last"] = decoded

@@ -322,6 +322,12 @@ fn a_ros_2_file_has_occupancy_grids_tf_and_odometry() {
         ("/tf", "tf2_msgs/msg/TFMessage", 3),
     ];
     assert_eq!(schemas(&topics), expected);
+    // As rosbag2 offers the topics: 1 keeps the newest message for later subscribers, 2 does not.
+    for (topic, durability) in [("/clearway/alpha/drivability", 1), ("/clearway/alpha/safe_path/poses", 1), ("/tf", 2)]
+    {
+        let qos = topics[topic]["metadata"]["offered_qos_profiles"].as_str().expect("a profile");
+        assert!(qos.contains(&format!("reliability: 1, durability: {durability}")), "{topic}: {qos}");
+    }
     let markers = topics["/clearway/alpha/safe_path/markers"]["last"]["markers"].as_array().unwrap();
     let of = |marker: &Value| json!([marker["ns"], marker["type"], marker["action"], marker["lifetime"]]);
     let lifetime = json!({"sec": 0, "nanosec": 300_000_000});

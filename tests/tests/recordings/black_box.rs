@@ -244,6 +244,47 @@ fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_
 }
 
 #[test]
+fn each_message_has_a_time_of_the_drive_and_a_chunk_half_a_second_of_it() {
+    let (config, disk) = (with_short_warm_up(config()), FailingDisk::default());
+    let core = config.vehicles[0].core();
+    let options = Recorder { part_s: 2, warm_up_ms: 0, flush_ms: 60_000, ..Recorder::default() };
+    // No data comes from the van.
+    let vehicles = ["car", "van"].map(|name| (name.into(), vec![])).into();
+    let header = Header { vehicles, config: config.to_toml(), ..Header::default() };
+    let began = Instant::now();
+    let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
+    let mut pipelines = [(); 2].map(|()| Pipeline::new(&core, vec![None]).unwrap());
+    handles.iter_mut().for_each(|handle| handle.set_config(core.clone(), vec![None]));
+    let start_ns = 1_700_000_000_000_000_000;
+    for sequence in 0..100 {
+        let now = Duration::from_millis(100 * sequence);
+        let arrival_ns = start_ns + now.as_nanos() as i64;
+        let event = Event { sequence, arrival_ns, source: 0, body: Body::Datagram(vec![7; 100].into()) };
+        handles[0].record_event(&event);
+        handles[0].keep_up(&event, &mut pipelines[0]);
+        handles[1].idle(&mut pipelines[1]);
+        while writer.write_next(began + now) {}
+    }
+    drop(handles);
+    writer.finish();
+    let drive = start_ns as u64..=start_ns as u64 + 10_000_000_000;
+    let (files, mut keyframes, mut chunks) = (disk.files.lock().unwrap(), 0, 0);
+    for bytes in files.values() {
+        for message in mcap::MessageStream::new(bytes).unwrap() {
+            let message = message.unwrap();
+            assert!(drive.contains(&message.log_time), "{} of {}", message.log_time, message.channel.topic);
+            keyframes += u64::from(message.channel.topic == "/van/keyframe");
+        }
+        let summary = mcap::Summary::read(bytes).unwrap().expect("a closed file");
+        for chunk in &summary.chunk_indexes {
+            assert!(chunk.message_end_time - chunk.message_start_time <= 500_000_000, "{chunk:?}");
+            chunks += 1;
+        }
+    }
+    assert!(files.len() >= 4 && keyframes >= 2 && chunks >= 20, "{} parts, {keyframes}, {chunks}", files.len());
+}
+
+#[test]
 fn each_event_is_durable_within_flush_ms_if_a_sync_takes_no_more_than_half_of_it() {
     let (config, disk) = (with_short_warm_up(config()), FailingDisk::default());
     let options = Recorder { flush_ms: 1000, ..Recorder::default() };

@@ -18,7 +18,8 @@
 //! `part` nor the last two channels: they are read as part 1.
 //!
 //! Chunks are compressed and have a CRC, as have the data section, the summary and each attachment. A chunk ends when
-//! it is full and at each [`McapFile::sync`], so a cut file ends with a whole chunk that was on the disk.
+//! it is full, after half a second of log time and at each [`McapFile::sync`], so a cut file ends with a whole chunk
+//! that was on the disk, and a replay's recording is cut like a drive's.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -54,6 +55,9 @@ pub struct Header {
 
 /// Length of a chunk before its compression, in bytes. Ours: what a damaged byte costs at most.
 const CHUNK_BYTES: u64 = 1 << 20;
+
+/// Log time after which a chunk ends, in ns. Ours: what a cut costs at most.
+pub const CHUNK_NS: u64 = 500_000_000;
 
 /// The disk that receives the bytes of one file: a file, or a simulated disk in tests.
 pub trait Disk: Write + Send {
@@ -143,6 +147,8 @@ pub struct McapFile<D: Disk> {
     vehicles: Vec<VehicleChannels>,
     counts: u16,
     newest_ns: i64,
+    /// Log time of the first message of the chunk.
+    chunk_ns: u64,
     records: RecordedMaps,
 }
 
@@ -153,8 +159,15 @@ struct VehicleChannels {
 }
 
 impl<D: Disk> McapFile<D> {
-    /// Writes the header of part number `part` to `disk`.
-    pub fn create(disk: D, recorded: RecordedMaps, header: &Header, part: u64) -> Result<Self, McapError> {
+    /// Writes the header of part number `part` to `disk`. Messages before its first event have the log time
+    /// `begins_ns`.
+    pub fn create(
+        disk: D,
+        recorded: RecordedMaps,
+        header: &Header,
+        part: u64,
+        begins_ns: i64,
+    ) -> Result<Self, McapError> {
         let disk = SharedDisk(Arc::new(Mutex::new(StopAtFailure { disk, failed: None, bytes: 0 })));
         let mut writer = WriteOptions::new()
             .profile("")
@@ -205,7 +218,8 @@ impl<D: Disk> McapFile<D> {
             vehicles.push(VehicleChannels { journal, keyframes, maps });
         }
         let counts = channel(counts, "/recorder/counts")?;
-        let mut file = Self { writer, disk, vehicles, counts, newest_ns: 0, records: recorded };
+        let (newest_ns, chunk_ns) = (begins_ns, 0);
+        let mut file = Self { writer, disk, vehicles, counts, newest_ns, chunk_ns, records: recorded };
         file.sync()?;
         Ok(file)
     }
@@ -253,6 +267,10 @@ impl<D: Disk> McapFile<D> {
         // MCAP has 32-bit sequences and no time before 1970; the message itself has the full values.
         let sequence = sequence as u32;
         let log_time = u64::try_from(arrival_ns).unwrap_or(0);
+        if log_time.abs_diff(self.chunk_ns) >= CHUNK_NS {
+            self.writer.flush()?;
+            self.chunk_ns = log_time;
+        }
         let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
         self.writer.write_to_known_channel(&header, data)
     }

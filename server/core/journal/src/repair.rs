@@ -10,6 +10,7 @@ use mcap::{Attachment, Compression, McapError, WriteOptions};
 use serde_json::{Value, json};
 
 use super::damage::Damage;
+use super::mcap_file::CHUNK_NS;
 use super::mcap_reader::{McapReadError, McapReader, REPAIR_LOST_KEY, REPAIR_METADATA};
 use crate::file_advice::advised;
 
@@ -122,7 +123,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
         .create(BufWriter::new(file))
         .map_err(failed)?;
     let mut report = Report::default();
-    let mut damages = 0;
+    let (mut damages, mut chunk_ns) = (0, 0);
     // Ids of the damaged file -> ids of the new one.
     let (mut schemas, mut channels) = (BTreeMap::from([(0, 0)]), BTreeMap::new());
     while let Some(record) = reader.next_record()? {
@@ -147,6 +148,10 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
                 Some(id) => {
                     header.channel_id = *id;
                     report.messages += 1;
+                    if header.log_time.abs_diff(chunk_ns) >= CHUNK_NS {
+                        writer.flush().map_err(failed)?;
+                        chunk_ns = header.log_time;
+                    }
                     writer.write_to_known_channel(&header, &data)
                 }
                 None => Ok(()),

@@ -227,7 +227,7 @@ pub fn verify(mut recording: RecordingReader, vehicles: Vec<RecordedVehicle>) ->
         report.incomplete.get_or_insert("a map stands before its events, so the file was changed".into());
     }
     for replay in &replays {
-        replay.end(has_changed || report.dropped > 0, &mut report);
+        replay.end(has_changed || report.dropped > 0 || report.events == 0, &mut report);
     }
     Ok(report)
 }
@@ -319,7 +319,8 @@ impl VehicleReplay {
         }
     }
 
-    /// Judges the maps that are only recorded or only computed. They are no differences if the file `lacks_messages`.
+    /// Judges the maps that are only recorded or only computed. They are no differences if the file `lacks_messages`,
+    /// as one with maps alone does.
     fn end(&self, lacks_messages: bool, report: &mut Report) {
         let is_unjudged = self.lacks_events || lacks_messages;
         for (sequence, layer) in &self.extra {

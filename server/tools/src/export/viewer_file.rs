@@ -30,6 +30,7 @@ use prost::Message as _;
 
 use super::scans::{DecodedScan, ScanDecoder, ScanPoints};
 use clearway_daemon::base::files;
+use clearway_journal::mcap_file::CHUNK_NS;
 use clearway_journal::mcap_reader::{Header, Message};
 
 /// Kind of the messages in the file.
@@ -45,6 +46,8 @@ pub enum Dialect {
 pub struct ViewerFile {
     dialect: Dialect,
     writer: mcap::Writer<BufWriter<File>>,
+    /// Log time of the first message of the chunk.
+    chunk_ns: u64,
     /// The id of each topic's channel and the sequence number of its newest message, by topic.
     channels: HashMap<String, (u16, u32)>,
     rasters: BTreeMap<String, Rasters>,
@@ -69,6 +72,7 @@ impl ViewerFile {
         Ok(Self {
             dialect,
             writer: options.create(BufWriter::new(open))?,
+            chunk_ns: 0,
             channels: HashMap::new(),
             rasters: BTreeMap::new(),
             placed: HashMap::new(),
@@ -218,13 +222,31 @@ impl ViewerFile {
             }
             None => {
                 let schema = self.writer.add_schema(schema, schema_encoding, definition)?;
-                let channel = self.writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
+                let metadata = if self.dialect == Dialect::Ros2 { ros_metadata(topic) } else { BTreeMap::new() };
+                let channel = self.writer.add_channel(schema, topic, encoding, &metadata)?;
                 self.channels.insert(topic.to_owned(), (channel, 0));
                 (channel, 0)
             }
         };
+        if log_time.abs_diff(self.chunk_ns) >= CHUNK_NS {
+            self.writer.flush()?;
+            self.chunk_ns = log_time;
+        }
         let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
         self.writer.write_to_known_channel(&header, message)?;
         Ok(())
     }
+}
+
+/// What rosbag2 offers a topic with when it plays the file, as the live topics are offered: reliable, and of maps the
+/// newest one for subscribers that come later. The numbers are those of `rmw/types.h`, which each version reads.
+fn ros_metadata(topic: &str) -> BTreeMap<String, String> {
+    let is_moving = topic == "/tf" || topic.contains("/points/") || topic.ends_with("/odometry");
+    let (depth, durability) = if is_moving { (100, 2) } else { (1, 1) };
+    let unlimited = "{sec: 0, nsec: 0}";
+    let profile = format!(
+        "- {{history: 1, depth: {depth}, reliability: 1, durability: {durability}, deadline: {unlimited}, lifespan: \
+         {unlimited}, liveliness: 1, liveliness_lease_duration: {unlimited}, avoid_ros_namespace_conventions: false}}"
+    );
+    BTreeMap::from([("offered_qos_profiles".to_owned(), profile)])
 }

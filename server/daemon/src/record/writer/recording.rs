@@ -1,5 +1,5 @@
-//! The recorder without a thread or clock of its own: items of the queue -> parts on the disk. Its owner passes the
-//! time.
+//! The recorder without a thread of its own: items of the queue -> parts on the disk. Its owner passes the time; only
+//! messages before the first event have that of the system.
 //!
 //! At most two parts are open: the one that is recorded, and the next one while vehicles warm up for it. A part that
 //! the disk refuses is left as it is; after [`RETRY`] the next part begins, if the disk takes it.
@@ -19,6 +19,7 @@ use super::counts::RecorderCounts;
 use super::folder::{Files, RecordError, with_cause};
 use super::handle::{Item, Link, RecordingHandle, WantedPart, link};
 use super::part::Part;
+use crate::base::clock::now_ns;
 use crate::config::Recorder as Options;
 use clearway_journal::encode::EncodedMap;
 use clearway_journal::mcap_file::{Header, McapFile};
@@ -52,6 +53,8 @@ pub struct RecordingWriter<F: Files> {
     wanted: WantedPart,
     /// Number of the newest part that was begun.
     newest_part: u64,
+    /// Arrival of the newest event; `None` before the first.
+    newest_ns: Option<i64>,
     /// Parts that were closed, and when.
     closed: VecDeque<(u64, Instant)>,
     sync_at: Option<Instant>,
@@ -94,6 +97,7 @@ impl<F: Files> RecordingWriter<F> {
             items,
             wanted,
             newest_part: 0,
+            newest_ns: None,
             closed: VecDeque::new(),
             sync_at: None,
             synced_at: now,
@@ -283,6 +287,7 @@ impl<F: Files> RecordingWriter<F> {
     }
 
     fn write_event(&mut self, vehicle: usize, event: &Event, now: Instant) {
+        self.newest_ns = Some(event.arrival_ns);
         let journal = self.counts.first_topic(vehicle);
         let VehicleState { part, warm_up, .. } = self.vehicles[vehicle];
         let mut is_written = false;
@@ -393,7 +398,8 @@ impl<F: Files> RecordingWriter<F> {
         let path = self.files.path(number);
         let create = |source| RecordError::Create { file: path.clone(), source };
         let disk = self.files.create(number).map_err(create)?;
-        let written = McapFile::create(disk, self.options.maps, &self.header, number);
+        let begins_ns = self.newest_ns.unwrap_or_else(now_ns);
+        let written = McapFile::create(disk, self.options.maps, &self.header, number, begins_ns);
         // A file without a whole header is of no use; once it is deleted, its number is free again.
         let is_free = written.is_err() && self.files.discard(number).is_ok();
         self.newest_part = if is_free { self.newest_part } else { number };
