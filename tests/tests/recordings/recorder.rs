@@ -249,6 +249,8 @@ async fn a_recording_is_split_saved_stopped_and_listed_over_zenoh() {
     ask("stop", Vec::new()).await.unwrap();
     until("the recorder has stopped", || running.vehicles.0[0].status.to_proto().recorder.unwrap().state == "stopped")
         .await;
+    let problem = running.vehicles.0[0].status.recorder_problem();
+    assert_eq!(problem.as_deref(), Some("stopped by a request"), "it is in the state of the vehicle");
     session.close().await.unwrap();
     within("shutdown", running.shutdown()).await.unwrap();
     assert!(verify(Path::new(&saved[0])).unwrap().is_good());

@@ -65,9 +65,10 @@ impl Changing {
         let (silent, lost) = (self.beat.elapsed(), self.lost());
         let is_hung = silent > SILENT_MAX && !self.has_ended;
         let hung = || is_hung.then(|| format!("the disk has not answered for {} s", silent.as_secs()));
+        let stopped = || (self.status.state == "stopped").then(|| "stopped by a request".to_owned());
         let late = || self.is_late.then(|| "the disk is too slow".to_owned());
         let lost = || (lost > 0).then(|| format!("{lost} events and maps are lost to the recording"));
-        self.reason.clone().or_else(hung).or_else(late).or_else(lost)
+        self.reason.clone().or_else(hung).or_else(stopped).or_else(late).or_else(lost)
     }
 }
 
