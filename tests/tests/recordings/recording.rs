@@ -269,9 +269,9 @@ fn drive_until(file: &Path, bytes: u64, data: SocketAddr) {
 }
 
 #[test]
-fn sigterm_leaves_a_whole_recording_and_sigkill_a_readable_one() {
+fn a_signal_that_ends_programs_leaves_a_whole_recording_and_sigkill_a_readable_one() {
     let folder = tempfile::tempdir().unwrap();
-    for (signal, cut) in [("-TERM", false), ("-KILL", true)] {
+    for (signal, cut) in [("-TERM", false), ("-USR1", false), ("-KILL", true)] {
         let file = folder.path().join(format!("live{signal}.mcap"));
         let (mut server, data) = serving(folder.path(), &file);
         drive_until(&file.with_extension("unfinished.mcap"), 1_000_000, data);

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, Error, Result};
+use futures::future::select_all;
 use indicatif::{ProgressBar, ProgressStyle};
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -95,16 +96,15 @@ pub fn block_on<T>(work: impl Future<Output = Result<T>>) -> Result<T> {
     runtime.context("start the runtime")?.block_on(work)
 }
 
-/// A future that resolves at SIGINT or SIGTERM. The signals are caught from this call on.
+/// A future that resolves at SIGINT, SIGTERM or another signal that ends programs. They are caught from this call on.
 ///
 /// # Errors
 /// If the system refuses to catch them.
 pub fn stop_signal() -> Result<impl Future<Output = ()>> {
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let [interrupt, terminate, quit] = [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::quit()];
+    let kinds = [interrupt, terminate, quit, SignalKind::user_defined1(), SignalKind::user_defined2()];
+    let mut signals = kinds.into_iter().map(signal).collect::<std::io::Result<Vec<_>>>()?;
     Ok(async move {
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
+        select_all(signals.iter_mut().map(|signal| Box::pin(signal.recv()))).await;
     })
 }
