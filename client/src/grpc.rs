@@ -137,7 +137,7 @@ impl Client {
             Some((_, port)) if port.parse::<u16>().is_err() => return Err(wrong("the port is no number up to 65535")),
             Some(_) => {}
         }
-        let url = format!("{scheme}{rest}");
+        let url = format!("{scheme}{}", with_zone_number(rest));
         let mut endpoint = Endpoint::from_shared(url.clone()).map_err(|error| wrong(&innermost(&error)))?;
         if let Some(tls) = tls {
             endpoint = endpoint.tls_config(tls.to_tonic()).map_err(|error| wrong(&innermost(&error)))?;
@@ -359,6 +359,16 @@ fn sequence_of_delta(bytes: Bytes) -> Option<u64> {
     let map = v1::Map::decode(bytes).ok()?;
     let is_delta = map.layers.iter().any(|layer| layer.base_sequence.is_some());
     map.header.filter(|_| is_delta).map(|header| header.sequence)
+}
+
+/// An address with the number of its IPv6 zone in place of the name, such as `[fe80::1%2]:50051`: URLs have no names.
+fn with_zone_number(address: &str) -> String {
+    let zone = address.split_once('%').and_then(|(_, rest)| Some(rest.split_once(']')?.0));
+    let number = |zone: &str| std::fs::read_to_string(format!("/sys/class/net/{zone}/ifindex")).ok();
+    match zone.and_then(|zone| Some((zone, number(zone)?))) {
+        Some((zone, number)) => address.replacen(&format!("%{zone}]"), &format!("%{}]", number.trim()), 1),
+        None => address.to_owned(),
+    }
 }
 
 async fn dial(endpoint: &Endpoint, address: &str) -> Result<Channel, ClientError> {

@@ -114,6 +114,18 @@ async fn a_peer_that_takes_no_byte_is_cut() {
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn an_ipv6_address_with_the_name_of_its_zone_is_reached() {
+    let mut config = everything();
+    config.grpc.listen = "[::1]:0".parse().unwrap();
+    let running = start(config).await;
+    for address in ["[::1%lo]", "http://[::1%lo]", "[::1%1]", "[::1]"] {
+        let client = Client::connect(&format!("{address}:{}", running.grpc.unwrap().port())).await;
+        assert_eq!(client.expect("the server answers").vehicles().await.unwrap().len(), 1, "{address}");
+    }
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn streams_of_one_vehicle_leave_another_its_places_and_a_refused_one_is_counted() {
     let mut config = everything();

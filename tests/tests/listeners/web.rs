@@ -23,6 +23,7 @@ async fn only_get_and_head_from_the_page_itself_are_answered() {
             ("127.0.0.1:8080", 200),
             ("192.168.1.7", 200),
             ("[::1]:8080", 200),
+            ("[fe80::1%25eth0]:8080", 200),
             ("localhost", 200),
             ("car.example:8080", 200),
             ("Car.Example:8080", 200),

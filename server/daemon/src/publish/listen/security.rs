@@ -1,6 +1,6 @@
 //! The certificates, roles and tokens that hold at present: they can be replaced while the server runs.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv6Addr};
 use std::sync::{Arc, RwLock};
 
 use super::access::Access;
@@ -58,8 +58,8 @@ impl Current {
     /// True if a browser may address the server by this host. Names have no case (RFC 9110, section 4.2.3).
     pub fn is_own_host(&self, host: &str) -> bool {
         let certified = self.tls.iter().flat_map(|tls| &tls.names);
-        // Another page cannot make a browser send an address that is not the server's own.
-        host.parse::<IpAddr>().is_ok()
+        // Another page cannot make a browser send an address that is not the server's own. Behind `%` is its zone.
+        host.split_once('%').map_or(host.parse::<IpAddr>().is_ok(), |(address, _)| address.parse::<Ipv6Addr>().is_ok())
             || host.eq_ignore_ascii_case("localhost")
             || self.hosts.iter().chain(certified).any(|own| own.eq_ignore_ascii_case(host))
     }
