@@ -33,7 +33,7 @@
 //! | valid GPRMC, pulse locked | - | `gps` | `gps` | `gps` if within reach |
 //! | valid GPRMC, pulse not locked | `gps_unlocked` | - | `gps_unlocked` | `gps_unlocked` if within reach |
 //! | GPRMC invalid; telemetry silent for 3 s; device counter jumps | `gps_unlocked` | - | - | - |
-//! | no valid GPRMC for 3 s, and the last ones agreed for less than 0.5 s or are ahead of arrival | new offset | new offset | - | - |
+//! | no valid GPRMC for 3 s, the last agreed for less than 0.5 s or are ahead | new offset | new offset | - | - |
 //! | device counter jumps, and arrival differs by 10 to 500 ms | `gps_unlocked` | - | new offset | new offset |
 //! | least delay rises by more than 500 ms | - | - | new offset | new offset |
 //! | least delay rises by more than 500 ms, in a burst | - | - | - | - |
@@ -56,8 +56,8 @@
 //! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays
 //!   in force if GPS or the pulse is lost, over a restart, and if the host is ahead of it. If it is not within reach,
 //!   the stamps go on by arrival. So do they if GPS is lost and nothing vouches for its hour or its date: its sentences
-//!   agreed for less than half a second, or it is ahead of the host by more than `ahead_ns_max`, so that no reader there
-//!   can use a map.
+//!   agreed for less than half a second, or it is ahead of the host by more than `ahead_ns_max`, so that no reader
+//!   there can use a map.
 //! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set forward.
 //!   If the packets come faster than they were sent, they have waited (a receiver that stood still, a network): then
 //!   the rise is an age and no offset, and the stamps must show it. A rise that stays cannot be told from a clock that
