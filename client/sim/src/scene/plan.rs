@@ -32,7 +32,7 @@ pub fn plan(truth: &TruthGrid, (ahead, beside): (f64, f64), (rows, columns): (us
                 Truth::Tight => ':',
                 Truth::Unreachable => '-',
                 Truth::Steep => '/',
-                Truth::Obstacle => '#',
+                Truth::Overhang | Truth::Obstacle => '#',
             });
         }
         page.push_str(line.trim_end());

@@ -24,7 +24,9 @@ pub enum Truth {
     Unreachable,
     /// Ground that is too steep, or the edge of a step that is too high.
     Steep,
-    /// Ground under an object that stands or hangs within the clearance.
+    /// Ground under an object that hangs within the clearance, at least [`HANGS_M_MIN`] over it, as a beam or branches.
+    Overhang,
+    /// Ground under an object that stands, or hangs lower.
     Obstacle,
 }
 
@@ -54,6 +56,10 @@ impl Default for Limits {
 /// Distance by which objects are widened, in cells: half the diagonal of a cell, so that no thin object falls between
 /// two cell centres.
 const OBJECT_MARGIN: f64 = 0.71;
+
+/// Least height of an overhang over the ground, metres. Ours: near a sensor the uppermost laser may pass under it, while
+/// it shows whatever hangs lower.
+pub const HANGS_M_MIN: f64 = 1.0;
 
 /// Raster of the truth about the ground around a vehicle, in its ego frame.
 #[derive(Clone, Debug)]
@@ -175,7 +181,9 @@ impl TruthGrid {
                         && bottom < ground + limits.clearance_m
                         && top > ground + limits.step_m_max
                     {
-                        self.classes[index] = Truth::Obstacle;
+                        let hangs = bottom > ground + HANGS_M_MIN;
+                        let class = if hangs { Truth::Overhang } else { Truth::Obstacle };
+                        self.classes[index] = self.classes[index].max(class);
                     }
                 }
             }
@@ -366,8 +374,10 @@ mod tests {
     }
 
     #[test]
-    fn a_beam_is_an_obstacle_below_the_clearance_only() {
-        for (underside, expected) in [(1.6, Truth::Obstacle), (2.4, Truth::Obstacle), (2.6, Truth::Drivable)] {
+    fn a_beam_is_an_overhang_below_the_clearance_and_an_obstacle_lower_only() {
+        let undersides =
+            [(0.9, Truth::Obstacle), (1.6, Truth::Overhang), (2.4, Truth::Overhang), (2.6, Truth::Drivable)];
+        for (underside, expected) in undersides {
             let world = World::on(Ground::default()).beam([8.0, -3.0], [8.0, 3.0], underside, underside + 0.5);
             assert_eq!(about(&world).class_at(8.0, 0.0), expected, "underside {underside}");
         }

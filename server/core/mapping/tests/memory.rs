@@ -81,7 +81,8 @@ fn known(layer: &Layer, vehicle: &SimulatedVehicle, stamp_ns: i64) -> Known {
         known.cells += 1;
         if name == "flat" {
             known.drivable += 1;
-            known.wrong += usize::from(matches!(truth.class_at(x, y), Truth::Obstacle | Truth::Unreachable));
+            known.wrong +=
+                usize::from(matches!(truth.class_at(x, y), Truth::Obstacle | Truth::Overhang | Truth::Unreachable));
         }
     }
     known

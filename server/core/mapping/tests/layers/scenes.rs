@@ -69,7 +69,7 @@ fn voted(scan: &SimulatedScan, layer: &Layer) -> Vec<Option<Truth>> {
             continue;
         }
         let class = match scan.truth.class_at(x.into(), y.into()) {
-            Truth::Obstacle | Truth::Outside => Truth::Tight,
+            Truth::Overhang | Truth::Obstacle | Truth::Outside => Truth::Tight,
             class => class,
         };
         votes[cell].0[CLASSES.iter().position(|c| *c == class).unwrap()] += 1;

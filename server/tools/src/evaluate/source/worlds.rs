@@ -99,7 +99,8 @@ fn step(pipeline: &mut Pipeline, arrival_ns: i64, body: Body) -> Option<i64> {
 fn known_places(truth: &TruthGrid) -> Vec<KnownPlace> {
     let vote = |class: &Truth| match class {
         Truth::Drivable | Truth::Outside => None,
-        Truth::Tight => Some(Vote::Either),
+        // What hangs higher than the uppermost laser looks cannot be known; what was seen of it are points.
+        Truth::Tight | Truth::Overhang => Some(Vote::Either),
         Truth::Unreachable => Some(Vote::Forbidden),
         Truth::Steep => Some(Vote::Steep),
         Truth::Obstacle => Some(Vote::Obstacle),
@@ -132,11 +133,11 @@ fn point(place: [f32; 3], truth: &TruthGrid) -> JudgedPoint {
         Truth::Unreachable => (UNREACHABLE, Vote::Forbidden),
         Truth::Drivable => ("ground", Vote::Drivable),
         // Ground in a cell of the truth that also has an object: both answers are correct.
-        Truth::Obstacle | Truth::Tight | Truth::Outside => ("ground", Vote::Either),
+        Truth::Obstacle | Truth::Overhang | Truth::Tight | Truth::Outside => ("ground", Vote::Either),
     };
     let scored = match here {
         _ if over > GROUND_M_MAX => Scored::Other,
-        Truth::Obstacle | Truth::Outside => Scored::Not,
+        Truth::Obstacle | Truth::Overhang | Truth::Outside => Scored::Not,
         _ => Scored::Ground,
     };
     JudgedPoint { place, over_m: over, class, vote, road: false, ground: [scored; 2] }
