@@ -132,6 +132,19 @@ impl SimulatedVehicle {
         TruthGrid::about(&self.scene.world, &pose, time, (half_extent_m, cell_m), limits)
     }
 
+    /// The same raster, still about the vehicle at `stamp_ns`, with the things where they were `ago_ns` before.
+    pub fn truth_before(
+        &self,
+        stamp_ns: i64,
+        ago_ns: i64,
+        half_extent_m: f64,
+        cell_m: f64,
+        limits: &Limits,
+    ) -> TruthGrid {
+        let (pose, time) = (self.pose_at(stamp_ns), self.time(stamp_ns - ago_ns));
+        TruthGrid::about(&self.scene.world, &pose, time, (half_extent_m, cell_m), limits)
+    }
+
     /// For each cell of a truth raster made for `stamp_ns`, true if the sensor can see the ground in it at that time.
     pub fn sees(&self, stamp_ns: i64, truth: &TruthGrid) -> Vec<bool> {
         let (map_from_ego, time) = (self.pose_at(stamp_ns), self.time(stamp_ns));

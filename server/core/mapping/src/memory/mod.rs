@@ -37,6 +37,13 @@ const NS_PER_S: f64 = 1e9;
 /// Nothing is remembered beyond this many times the range of the farthest return of the newest map in that direction.
 /// Ours: the rings of 16 lasers on flat ground are at 7, 8, 11, 15, 21 and 38 m.
 const VIEW: f32 = 2.0;
+/// Least height over the ground, as a share of its range, and least range, metres, of an obstacle that is forgotten if
+/// the newest map has no point in it, but one behind it. Ours: the lasers of 16 are 2 degrees apart, so that one of them
+/// meets it if it still stands there.
+const TALL_MIN: f32 = 0.035;
+const TALL_RANGE_M_MIN: f32 = 5.0;
+/// Least distance of the point behind it, metres. Ours: a car is longer.
+const BEHIND_M: f32 = 1.0;
 /// Number of directions in which the map may have no return.
 const DIRECTIONS: usize = AzimuthColumns::TWO_DEGREES as usize;
 
@@ -53,6 +60,8 @@ struct Cell {
     obstacle_m: f64,
     /// Stamp of that map, ns; 0 without an obstacle.
     obstacle_ns: i64,
+    /// Height of that obstacle over the ground, metres.
+    tall_m: f32,
 }
 
 /// The memory of one vehicle.
@@ -130,13 +139,14 @@ impl Memory {
             let (is_ground, is_obstacle) = (height.abs() <= GROUND_M_MAX, OBSTACLE_M.contains(&height));
             if (is_ground || is_obstacle) && x * x + y * y <= range_squared {
                 let point = pose * Point3::new(x, y, z).cast::<f64>();
-                self.insert(point, is_obstacle, stamp_ns);
+                self.insert(point, is_obstacle.then_some(height), stamp_ns);
             }
         }
         self.extended = sweep;
     }
 
-    fn insert(&mut self, point: Point3<f64>, is_obstacle: bool, stamp_ns: i64) {
+    /// Remembers a point of the ground, or of an obstacle at this height over it.
+    fn insert(&mut self, point: Point3<f64>, obstacle: Option<f32>, stamp_ns: i64) {
         let world = [point.x, point.y].map(|metres| (metres / CELL_M).floor() as i64);
         let index = (world[1].rem_euclid(SIDE) * SIDE + world[0].rem_euclid(SIDE)) as usize;
         let cell = &mut self.cells[index];
@@ -146,9 +156,10 @@ impl Memory {
         if cell.world != world {
             *cell = Cell { world, ..Cell::default() };
         }
-        if is_obstacle {
-            let is_higher = cell.obstacle_ns != stamp_ns || point.z > cell.obstacle_m;
-            cell.obstacle_m = if is_higher { point.z } else { cell.obstacle_m };
+        if let Some(height_m) = obstacle {
+            if cell.obstacle_ns != stamp_ns || point.z > cell.obstacle_m {
+                (cell.obstacle_m, cell.tall_m) = (point.z, height_m);
+            }
             cell.obstacle_ns = stamp_ns;
         } else {
             let is_lower = cell.ground_ns != stamp_ns || point.z < cell.ground_m;
@@ -193,8 +204,10 @@ impl Memory {
             let z = if cell.obstacle_ns != 0 { cell.obstacle_m } else { cell.ground_m };
             let point = (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
             let range_m = libm::hypotf(point.x, point.y);
-            let in_view = VIEW * view_m[self.azimuths.column(point.x, point.y) as usize] >= range_m;
-            if range_m <= RANGE_M_MAX && in_view {
+            let view_m = view_m[self.azimuths.column(point.x, point.y) as usize];
+            let is_tall = cell.tall_m >= TALL_MIN * range_m && range_m >= TALL_RANGE_M_MIN;
+            let has_moved = cell.obstacle_ns != 0 && is_tall && view_m >= range_m + BEHIND_M;
+            if range_m <= RANGE_M_MAX && VIEW * view_m >= range_m && !has_moved {
                 self.extended.push_remembered([point.x, point.y, point.z]);
             }
         }

@@ -193,7 +193,7 @@ impl FreeGround {
 }
 
 /// Greatest spread of heights over a plane that is one level, in metres: less than a kerb, more than noise.
-const LEVEL_M_MAX: f64 = 0.12;
+const LEVEL_M_MAX: f64 = 0.10;
 
 fn role(point: &JudgedPoint) -> Option<PointRole> {
     let (over, is_ground) = (point.over_m, point.ground[0] == Scored::Ground);

@@ -74,11 +74,15 @@ pub fn drive(
             step(&mut pipeline, next_pose_ns, pose);
             next_pose_ns += POSE_PERIOD_NS;
         }
-        let Some(end_ns) = step(&mut pipeline, datagram.stamp_ns, Body::Datagram(Bytes::from(datagram.payload))) else {
+        let Some([start_ns, end_ns]) =
+            step(&mut pipeline, datagram.stamp_ns, Body::Datagram(Bytes::from(datagram.payload)))
+        else {
             continue;
         };
-        let truth = vehicle.truth_at(end_ns, RASTER_M.0, RASTER_M.1, &Limits::default());
-        let (points, known) = (points(pipeline.newest_sweep(), &truth), known_places(&truth));
+        let limits = Limits::default();
+        let truth = vehicle.truth_at(end_ns, RASTER_M.0, RASTER_M.1, &limits);
+        let before = vehicle.truth_before(end_ns, end_ns - start_ns, RASTER_M.0, RASTER_M.1, &limits);
+        let (points, known) = (points(pipeline.newest_sweep(), &truth), known_places(&truth, &before));
         judge(&pipeline, &extrinsics, FrameTruth { points: &points, whole: &points, known: &known })?;
         judged += 1;
         if judged == revolutions {
@@ -88,27 +92,31 @@ pub fn drive(
     Ok(())
 }
 
-/// The stamp of the map that the event completed; `None` without a map or if a sensor's revolution in it is partial.
-fn step(pipeline: &mut Pipeline, arrival_ns: i64, body: Body) -> Option<i64> {
+/// The stamps at which the capture of the map that the event completed began and ended; `None` without a map or if a sensor's revolution in it is partial.
+fn step(pipeline: &mut Pipeline, arrival_ns: i64, body: Body) -> Option<[i64; 2]> {
     let made = pipeline.step(&Event { sequence: 0, arrival_ns, source: 0, body });
     let map = made.expect("the pipeline accepts the simulator's datagrams and poses")?;
-    map.sensors.iter().all(|sensor| sensor.partial.is_empty()).then_some(map.capture_end_ns)
+    let stamps_ns = [map.capture_start_ns, map.capture_end_ns];
+    map.sensors.iter().all(|sensor| sensor.partial.is_empty()).then_some(stamps_ns)
 }
 
-/// The places of the truth's raster on which no vehicle may stand, or perhaps none.
-fn known_places(truth: &TruthGrid) -> Vec<KnownPlace> {
-    let vote = |class: &Truth| match class {
+/// The places of the truth's raster on which no vehicle may stand, or perhaps none. `before` is the truth when the
+/// capture of the map began.
+fn known_places(truth: &TruthGrid, before: &TruthGrid) -> Vec<KnownPlace> {
+    let vote = |(class, before): (&Truth, &Truth)| match class {
         Truth::Drivable | Truth::Outside => None,
         // What hangs higher than the uppermost laser looks cannot be known; what was seen of it are points.
         Truth::Tight | Truth::Overhang => Some(Vote::Either),
         Truth::Unreachable => Some(Vote::Forbidden),
         Truth::Steep => Some(Vote::Steep),
+        // A thing that came while the scan was made may have been seen elsewhere.
+        Truth::Obstacle if *before != Truth::Obstacle => Some(Vote::Either),
         Truth::Obstacle => Some(Vote::Obstacle),
     };
     let place = |index: usize| <[f64; 2]>::from(truth.middle(index)).map(|place| place as f32);
     (0..)
-        .zip(&truth.classes)
-        .filter_map(|(index, class)| Some(KnownPlace { place: place(index), vote: vote(class)? }))
+        .zip(truth.classes.iter().zip(&before.classes))
+        .filter_map(|(index, classes)| Some(KnownPlace { place: place(index), vote: vote(classes)? }))
         .collect()
 }
 
