@@ -57,7 +57,8 @@ use troughs::Troughs;
 
 /// Number of points that are processed together. Ours: their cells fit into the first-level cache.
 const CHUNK: usize = 1024;
-/// Least height that an obstacle's returns span if it casts a shadow, metres. Ours: kerbs cast none; not tuned.
+/// Least height that an obstacle's returns span if it casts a shadow, metres; of what stands on the ground, from the
+/// ground on. Ours: kerbs cast none; not tuned.
 const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
 
 /// Height over the ground below which a return shows the ground and its steps, metres. Ours: it is no obstacle to any
@@ -362,7 +363,8 @@ impl Reach {
             if let Some(polar) = self.polar_of_cell[cell].index() {
                 self.has_obstacle[polar] = true;
             }
-            if span_m[1] - span_m[0] >= SHADOW_HEIGHT_M_MIN {
+            let from_m = if span_m[0] < shadow::UNDER_M_MIN { 0.0 } else { span_m[0] };
+            if span_m[1] - from_m >= SHADOW_HEIGHT_M_MIN {
                 self.shadow.cast(cell, CELL_M, span_m, sensor_m);
             }
         }

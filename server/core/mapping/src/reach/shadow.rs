@@ -14,7 +14,7 @@ const STEPS: usize = 64;
 
 /// Least height over the ground of the lowest return of an obstacle, metres, under which ground counts as seen. Ours:
 /// ground that is seen under a lower one, such as the body of a car, lies in what stands on it.
-const UNDER_M_MIN: f32 = 1.0;
+pub const UNDER_M_MIN: f32 = 1.0;
 
 /// Place of a cell's centre, in half the bytes of its azimuth and distance.
 #[derive(Clone, Copy, Debug)]
