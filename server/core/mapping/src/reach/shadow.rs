@@ -9,8 +9,10 @@ use std::f32::consts::TAU;
 /// Number of azimuths about the vehicle. Ours: 90 degrees are a whole number of azimuths, and no centre of a cell lies
 /// on the border between two.
 const AZIMUTHS: usize = 1440;
-/// Number of distance steps. Ours: one bit each of a 64-bit word.
-const STEPS: usize = 64;
+/// Number of distance steps, one bit each, and number of them in a metre. Ours: half a metre each, for a body is free
+/// from its face to the step behind it; what is farther away than all steps counts as in the last one.
+const STEPS: usize = 128;
+const STEPS_A_M: f32 = STEPS as f32 / 64.0;
 
 /// Least height over the ground of the lowest return of an obstacle, metres, under which ground counts as seen. Ours:
 /// ground that is seen under a lower one, such as the body of a car, lies in what stands on it.
@@ -30,19 +32,18 @@ pub struct Shadow {
     distances_m: Vec<f32>,
     /// By cell: azimuth and distance step of its centre.
     places: Vec<Place>,
-    steps_a_m: f32,
     /// By azimuth: one bit for each distance step, set if it is hidden.
-    hidden: Vec<u64>,
+    hidden: Vec<u128>,
 }
 
 impl Shadow {
     /// Shadows on cells with these centres; none yet.
     pub fn new(centres_m: impl Iterator<Item = [f32; 2]>) -> Self {
         let (azimuths, distances_m): (Vec<u16>, Vec<f32>) = centres_m.map(polar).unzip();
-        let steps_a_m = (STEPS - 1) as f32 / distances_m.iter().copied().fold(1.0, f32::max);
-        let place = |(azimuth, distance_m): (u16, &f32)| Place { azimuth, step: (distance_m * steps_a_m) as u8 };
+        let step = |distance_m: f32| (distance_m * STEPS_A_M).min((STEPS - 1) as f32) as u8;
+        let place = |(azimuth, distance_m): (u16, &f32)| Place { azimuth, step: step(*distance_m) };
         let places = azimuths.into_iter().zip(&distances_m).map(place).collect();
-        Self { distances_m, places, steps_a_m, hidden: vec![0; AZIMUTHS] }
+        Self { distances_m, places, hidden: vec![0; AZIMUTHS] }
     }
 
     /// Removes all shadows.
@@ -60,12 +61,12 @@ impl Shadow {
         };
         // The shadow begins with the step behind the obstacle.
         let under_m = if lowest_m < UNDER_M_MIN { 0.0 } else { lowest_m };
-        let first = (meets(under_m).max(distance_m + cell_m) * self.steps_a_m).ceil() as usize;
-        let last = (meets(highest_m) * self.steps_a_m).min(STEPS as f32) as usize;
+        let first = (meets(under_m).max(distance_m + cell_m) * STEPS_A_M).ceil() as usize;
+        let last = (meets(highest_m) * STEPS_A_M).min(STEPS as f32) as usize;
         if first >= last {
             return;
         }
-        let steps = (u64::MAX >> (STEPS - (last - first))) << first;
+        let steps = (u128::MAX >> (STEPS - (last - first))) << first;
         let half_width = (cell_m / 2.0 / distance_m * AZIMUTHS as f32 / TAU) as usize;
         for azimuth in usize::from(azimuth) + AZIMUTHS - half_width..=usize::from(azimuth) + AZIMUTHS + half_width {
             self.hidden[azimuth % AZIMUTHS] |= steps;

@@ -78,6 +78,21 @@ fn a_wall_is_occupied_and_nothing_behind_it_is_free() {
 }
 
 #[test]
+fn the_body_of_a_car_ahead_is_not_free_from_a_metre_behind_its_rear_on() {
+    for model in [Model::Hdl64eS2, Model::Hdl32e] {
+        for rear_m in [9.0, 15.0, 20.0, 26.0, 30.0] {
+            let car = |x: f32, y: f32, z: f32| {
+                let is_in = (rear_m..rear_m + 4.4).contains(&x) && y.abs() < 0.9;
+                z <= 0.0 || is_in && (0.18..0.85).contains(&z)
+            };
+            let layer = freespace(&cast(model, car));
+            let free = count(&layer, FreespaceClass::Free, [rear_m + 1.1, rear_m + 4.2], [-0.6, 0.6]);
+            assert_eq!(free, 0, "{model:?}, {rear_m} m");
+        }
+    }
+}
+
+#[test]
 fn a_log_is_low_and_a_trench_is_a_drop() {
     for (at_m, across_m) in [(7.0, 0.0), (10.0, 0.0), (9.0, 4.0)] {
         let log = |x: f32, y: f32, z: f32| {
