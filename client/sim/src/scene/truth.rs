@@ -57,8 +57,8 @@ impl Default for Limits {
 /// two cell centres.
 const OBJECT_MARGIN: f64 = 0.71;
 
-/// Least height of an overhang over the ground, metres. Ours: near a sensor the uppermost laser may pass under it, while
-/// it shows whatever hangs lower.
+/// Least height of an overhang over the ground, metres. Ours: near a sensor the uppermost laser may pass under it, but
+/// meets what hangs lower.
 pub const HANGS_M_MIN: f64 = 1.0;
 
 /// Raster of the truth about the ground around a vehicle, in its ego frame.

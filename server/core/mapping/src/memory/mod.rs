@@ -38,7 +38,7 @@ const NS_PER_S: f64 = 1e9;
 /// Ours: the rings of 16 lasers on flat ground are at 7, 8, 11, 15, 21 and 38 m.
 const VIEW: f32 = 2.0;
 /// Least height over the ground, as a share of its range, and least range, metres, of an obstacle that is forgotten if
-/// the newest map has no point in it, but one behind it. Ours: the lasers of 16 are 2 degrees apart, so that one of them
+/// the newest map has no point in it, but one behind it. Ours: the lasers of a VLP-16 are 2 degrees apart, so that one
 /// meets it if it still stands there.
 const TALL_MIN: f32 = 0.035;
 const TALL_RANGE_M_MIN: f32 = 5.0;

@@ -92,7 +92,8 @@ pub fn drive(
     Ok(())
 }
 
-/// The stamps at which the capture of the map that the event completed began and ended; `None` without a map or if a sensor's revolution in it is partial.
+/// The stamps at which the capture of the map that the event completed began and ended; `None` without a map or if a
+/// sensor's revolution in it is partial.
 fn step(pipeline: &mut Pipeline, arrival_ns: i64, body: Body) -> Option<[i64; 2]> {
     let made = pipeline.step(&Event { sequence: 0, arrival_ns, source: 0, body });
     let map = made.expect("the pipeline accepts the simulator's datagrams and poses")?;
