@@ -102,7 +102,7 @@ fn a_turn_comes_with_the_truth_of_its_end() {
     assert_eq!(scan.truth.class_at(6.0, 0.0), Truth::Drivable, "under the canopy");
     let ahead = scenes::fenced_road_with_low_overhang();
     let scan = SimulatedVehicle::new(ahead, ScannerConfig::default()).true_revolution(0);
-    assert_eq!(scan.truth.class_at(4.0, 0.0), Truth::Obstacle, "the overhang");
+    assert_eq!(scan.truth.class_at(4.0, 0.0), Truth::Overhang, "the overhang");
     assert_eq!(scan.truth.class_at(14.0, 0.0), Truth::Unreachable, "behind the overhang");
     assert_eq!(scan.truth.class_at(-5.0, 0.0), Truth::Drivable, "the way back");
 }
