@@ -122,10 +122,9 @@ impl Browser {
         self.post(&format!("{}/element/{element}/value", self.session), json!({ "text": keys }));
     }
 
-    /// Clicks the middle of an element.
+    /// Clicks the element, not the place at which it was: a new map may move it meanwhile.
     pub fn click(&self, selector: &str) {
-        let element = self.find(selector);
-        self.post(&format!("{}/element/{element}/click", self.session), json!({}));
+        self.run(&format!("document.querySelector({selector:?}).click()"));
     }
 
     /// Keeps a picture of the window in `target/page`.
