@@ -275,9 +275,7 @@ async fn digests_in_place_of_maps_prove_the_same_and_events_alone_make_the_maps_
         within("shutdown", running.shutdown()).await.unwrap();
     }
     let length = |name: &str| std::fs::metadata(at(name)).unwrap().len();
-    // Digests are as short as the difference that compression makes.
-    let [none, digest, full] = ["none.mcap", "digest.mcap", "full.mcap"].map(length);
-    assert!(none.max(digest) < full, "{none}, {digest}, {full} bytes");
+    assert!(length("none.mcap").max(length("digest.mcap")) < length("full.mcap"));
     for part in [".mcap", ".part-0002.mcap"] {
         let [full, digest, none] =
             ["full", "digest", "none"].map(|name| verify(&at(&format!("{name}{part}"))).unwrap());
