@@ -197,8 +197,7 @@ async fn the_queue_of_a_recorder_costs_no_map_its_pose() {
     let bursts = |after_ns: i64| (after_ns / 250_000_000 + 1) * 250_000_000 + after_ns % 1000;
     let outage = |after_ns: i64| if (500_000_000..900_000_000).contains(&after_ns) { 900_000_000 } else { after_ns };
     let late = |after_ns: i64| after_ns + if after_ns < 500_000_000 { 0 } else { 150_000_000 };
-    let logs: [(&str, fn(i64) -> i64); 3] = [("bursts", bursts), ("an outage", outage), ("a delay that lasts", late)];
-    for (what, logged) in logs {
+    for (what, logged) in [("bursts", bursts as fn(i64) -> i64), ("an outage", outage), ("a delay that lasts", late)] {
         let (summary, headers) = replayed_bag(shifted_drive(|_| 0, |_| 0, logged), &[]).await;
         let text = summary.to_text();
         assert!(!text.contains("one clock stepped") && headers.len() >= 10, "{what}: {text}");
