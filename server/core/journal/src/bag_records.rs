@@ -74,7 +74,9 @@ impl BagRecords {
         let mut topics = bag.prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")?;
         let mut rows = topics.query([])?;
         while let Some(row) = rows.next()? {
-            let (id, topic, name, message_encoding) = (row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?);
+            let (id, topic, name, encoding): (_, _, _, String) = (row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?);
+            // Some recorders leave out the name of the only encoding that ROS 2 has.
+            let message_encoding = if encoding.is_empty() { "cdr".to_owned() } else { encoding };
             // A bag has no definitions of its types; an empty encoding says so.
             let header = SchemaHeader { id, name, encoding: String::new() };
             waiting.push_back(Record::Schema { header, data: Vec::new().into() });

@@ -303,6 +303,9 @@ impl AvailableTopics {
             }
             (kind, _) if kind.is_sensor() => match self.refused_mount(frame) {
                 Some(fault) => format!("the transform that places its frame {frame} was refused: {fault}"),
+                None if self.frames.a_from_b(ego_frame, self.placed_frame(frame)).is_some() => {
+                    format!("tf places its frame {frame}, and other topics were chosen; --topic chooses it")
+                }
                 None => format!("tf does not place its frame {frame}; --topic with --extrinsics uses it"),
             },
             (Kind::Odometry, _) if !self.is_joined(found, ego_frame) => {
