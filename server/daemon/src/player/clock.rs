@@ -29,7 +29,7 @@ struct StampLag {
 
 /// Smallest lag that is followed, in ns. Ours: a third of the validity of a map.
 const LAG_STEP_NS: i64 = 100_000_000;
-/// Number of maps in a row after which a greater lag is that of a clock. Ours: one second.
+/// Number of maps in a row after which a greater lag is a clock's. Ours: one second.
 const LATE_MAPS_MAX: u32 = 10;
 
 impl StampLag {
@@ -97,8 +97,8 @@ impl ReplayClock {
         self.lag.add(at_ns.saturating_sub(capture_end_ns));
     }
 
-    /// The header that a map of the recorded time `at_ns` is served with; `None` for that of the recorded map. As live
-    /// its stamps follow this machine's clock, also if those of the drive are behind its arrivals.
+    /// The header that a map of the recorded time `at_ns` is served with; `None` for the recorded map's own. As live
+    /// its stamps follow this machine's clock, also if the drive's stamps are behind its arrivals.
     pub fn replayed(&self, state: &v1::ReplayState, boot_id: u64, at_ns: i64, wall_ns: i64) -> Option<Replayed> {
         let shift_ns = match state.as_live {
             true => self.shift_ns(at_ns, wall_ns).saturating_add(self.lag.ns.unwrap_or(0)),

@@ -239,7 +239,7 @@ impl ViewerFile {
 }
 
 /// What rosbag2 offers a topic with when it plays the file, as the live topics are offered: reliable, and of maps the
-/// newest one for subscribers that come later. The numbers are those of `rmw/types.h`, which each version reads.
+/// newest one for subscribers that come later. The numbers come from `rmw/types.h`, which each version reads.
 fn ros_metadata(topic: &str) -> BTreeMap<String, String> {
     let is_moving = topic == "/tf" || topic.contains("/points/") || topic.ends_with("/odometry");
     let (depth, durability) = if is_moving { (100, 2) } else { (1, 1) };

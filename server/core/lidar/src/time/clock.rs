@@ -101,7 +101,7 @@ const EPOCH_NS_MIN: i64 = NS_PER_SECOND;
 /// which ten seconds are soon enough.
 const CHANGE_NS_MIN: i64 = 100_000_000;
 
-/// Time, in ns, after which a delay that has risen is that of a host whose clock was set, although the device's minutes
+/// Time, in ns, after which a delay that has risen means that the host's clock was set, although the device's minutes
 /// agree with UTC. Ours: packets that wait for so long on their way do not all wait for the same time.
 const RISE_NS: i64 = 5 * NS_PER_SECOND;
 

@@ -57,9 +57,6 @@ use troughs::Troughs;
 
 /// Number of points that are processed together. Ours: their cells fit into the first-level cache.
 const CHUNK: usize = 1024;
-/// Least height that an obstacle's returns span if it casts a shadow, metres; of what stands on the ground, from the
-/// ground on. Ours: kerbs cast none; not tuned.
-const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
 
 /// Height over the ground below which a return shows the ground and its steps, metres. Ours: it is no obstacle to any
 /// vehicle; a higher one, whatever obstacles the vehicle drives over, is the side of a thing and no step.
@@ -363,10 +360,7 @@ impl Reach {
             if let Some(polar) = self.polar_of_cell[cell].index() {
                 self.has_obstacle[polar] = true;
             }
-            let from_m = if span_m[0] < shadow::UNDER_M_MIN { 0.0 } else { span_m[0] };
-            if span_m[1] - from_m >= SHADOW_HEIGHT_M_MIN {
-                self.shadow.cast(cell, CELL_M, span_m, sensor_m);
-            }
+            self.shadow.cast(cell, CELL_M, span_m, sensor_m);
         }
         self.classify_polar_cells(confidences);
         self.assume_near_ground(confidences);

@@ -16,7 +16,10 @@ const STEPS_A_M: f32 = STEPS as f32 / 64.0;
 
 /// Least height over the ground of the lowest return of an obstacle, metres, under which ground counts as seen. Ours:
 /// ground that is seen under a lower one, such as the body of a car, lies in what stands on it.
-pub const UNDER_M_MIN: f32 = 1.0;
+const UNDER_M_MIN: f32 = 1.0;
+/// Least height that an obstacle spans if it casts a shadow, metres; of what stands on the ground, from the ground on.
+/// Ours: kerbs cast none; not tuned.
+const HEIGHT_M_MIN: f32 = 0.5;
 
 /// Place of a cell's centre, in half the bytes of its azimuth and distance.
 #[derive(Clone, Copy, Debug)]
@@ -51,16 +54,19 @@ impl Shadow {
         self.hidden.fill(0);
     }
 
-    /// Adds the shadow of an obstacle that spans these heights in a cell of this size, with the sensor at height
+    /// Adds the shadow, if it casts one, of an obstacle that spans these heights in a cell of this size, with the sensor at height
     /// `sensor_m`.
     pub fn cast(&mut self, cell: usize, cell_m: f32, [lowest_m, highest_m]: [f32; 2], sensor_m: f32) {
+        let under_m = if lowest_m < UNDER_M_MIN { 0.0 } else { lowest_m };
+        if highest_m - under_m < HEIGHT_M_MIN {
+            return;
+        }
         let (azimuth, distance_m) = (self.places[cell].azimuth, self.distances_m[cell]);
         // Distance at which the ray over a height meets the ground.
         let meets = |height_m: f32| {
             if height_m < sensor_m { distance_m * sensor_m / (sensor_m - height_m) } else { f32::INFINITY }
         };
         // The shadow begins with the step behind the obstacle.
-        let under_m = if lowest_m < UNDER_M_MIN { 0.0 } else { lowest_m };
         let first = (meets(under_m).max(distance_m + cell_m) * STEPS_A_M).ceil() as usize;
         let last = (meets(highest_m) * STEPS_A_M).min(STEPS as f32) as usize;
         if first >= last {

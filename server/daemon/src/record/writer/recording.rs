@@ -1,5 +1,5 @@
 //! The recorder without a thread of its own: items of the queue -> parts on the disk. Its owner passes the time; only
-//! messages before the first event have that of the system.
+//! messages before the first event have the system's time.
 //!
 //! At most two parts are open: the one that is recorded, and the next one while vehicles warm up for it. A part that
 //! the disk refuses is left as it is; after [`RETRY`] the next part begins, if the disk takes it.

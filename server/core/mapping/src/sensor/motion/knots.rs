@@ -44,7 +44,7 @@ impl ScanKnots {
         span_ns * knot as i64 / self.steps().max(1) - span_ns
     }
 
-    /// Index of the last knot before a point, never that of the last of all, and the share of the step to the next one.
+    /// Index of the last knot before a point, never of the last of all, and the share of the step to the next one.
     #[inline(always)]
     pub(crate) fn position(&self, offset_ns: i32) -> (usize, f32) {
         let span_ns = self.span_ns.unwrap_or(0);
