@@ -54,8 +54,8 @@ impl Shadow {
         self.hidden.fill(0);
     }
 
-    /// Adds the shadow, if it casts one, of an obstacle that spans these heights in a cell of this size, with the sensor
-    /// at height `sensor_m`.
+    /// Adds the shadow, if it casts one, of an obstacle that spans these heights in a cell of this size, with the
+    /// sensor at height `sensor_m`.
     pub fn cast(&mut self, cell: usize, cell_m: f32, [lowest_m, highest_m]: [f32; 2], sensor_m: f32) {
         let under_m = if lowest_m < UNDER_M_MIN { 0.0 } else { lowest_m };
         if highest_m - under_m < HEIGHT_M_MIN {
