@@ -16,11 +16,13 @@
 //! | `point_times` | times as written -> unit, and ns after the header's stamp |
 //! | [`occupancy_grid`] | cells -> `nav_msgs/OccupancyGrid` |
 //! | [`markers`] | lines -> `visualization_msgs/MarkerArray` |
+//! | [`diagnostics`] | states of components -> `diagnostic_msgs/DiagnosticArray` |
 //! | [`pose`] | `Odometry`, `PoseStamped`, `TFMessage` -> poses; poses -> `Odometry`, `TFMessage`, `PoseArray` |
 //! | [`frames`] | transforms -> pose of one frame in another |
 //! | [`published`] | the published types: names, hashes, definitions |
 
 pub mod cdr;
+pub mod diagnostics;
 pub mod frames;
 pub mod kind;
 pub mod markers;

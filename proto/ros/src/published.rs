@@ -85,3 +85,11 @@ pub const BOOL: Published = Published::new(
     "RIHS01_feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9",
     include_str!("definitions/Bool.msg"),
 );
+
+/// `diagnostic_msgs/msg/DiagnosticArray`.
+pub const DIAGNOSTIC_ARRAY: Published = Published::new(
+    "diagnostic_msgs",
+    "DiagnosticArray",
+    "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    include_str!("definitions/DiagnosticArray.msg"),
+);

@@ -1,6 +1,7 @@
 //! Messages written by rosbags are read correctly, and messages written here equal those of rosbags.
 
 use clearway_ros::cdr::Header;
+use clearway_ros::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
 use clearway_ros::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::pose::{
     Odometry, StampedTransform, Twist, pose_array_to_cdr, pose_stamped, tf_message, tf_message_to_cdr,
@@ -101,6 +102,21 @@ fn poses_and_lines_are_written_as_by_rosbags() {
         Lines { name: "radii", width_m: 0.05, rgba: [0.0, 0.0, 1.0, 0.5], points: Vec::new() },
     ];
     assert_eq!(marker_array_to_cdr(&header, 1_500_000_000, &markers), golden("marker_array"));
+}
+
+#[test]
+fn states_are_written_as_by_rosbags() {
+    let header = Header { stamp_ns: STAMP_NS, frame_id: "" };
+    let of = |level, vehicle: &str, message: &str, values| {
+        let (name, hardware_id) = (format!("clearway: {vehicle}"), vehicle.to_owned());
+        Diagnostic { level, name, message: message.to_owned(), hardware_id, values }
+    };
+    let values = vec![("loss", "0.125".to_owned()), ("maps", "12".to_owned())];
+    let states = [
+        of(DiagnosticLevel::Error, "car", "no packets from top for 3.1 s", values),
+        of(DiagnosticLevel::Ok, "bus", "", Vec::new()),
+    ];
+    assert_eq!(diagnostic_array_to_cdr(&header, &states), golden("diagnostic_array"));
 }
 
 #[test]

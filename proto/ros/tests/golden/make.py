@@ -113,6 +113,11 @@ def lines(name, action, width, rgba, points):
 write("marker_array.cdr", T["visualization_msgs/msg/MarkerArray"](markers=[
     lines("links", 0, 0.1, (1.0, 0.5, 0.25, 1.0), [(1.0, 2.0, 0.0), (3.0, -4.0, 0.5)]),
     lines("radii", 2, 0.05, (0.0, 0.0, 1.0, 0.5), [])]))
+value, status = T["diagnostic_msgs/msg/KeyValue"], T["diagnostic_msgs/msg/DiagnosticStatus"]
+write("diagnostic_array.cdr", T["diagnostic_msgs/msg/DiagnosticArray"](header=header(""), status=[
+    status(level=2, name="clearway: car", message="no packets from top for 3.1 s", hardware_id="car",
+           values=[value(key="loss", value="0.125"), value(key="maps", value="12")]),
+    status(level=0, name="clearway: bus", message="", hardware_id="bus", values=[])]))
 packets = [T["velodyne_msgs/msg/VelodynePacket"](
     stamp=T["builtin_interfaces/msg/Time"](sec=SEC, nanosec=i), data=np.full(1206, i, np.uint8)) for i in range(3)]
 write("velodyne_scan.cdr", T["velodyne_msgs/msg/VelodyneScan"](header=header("velodyne"), packets=packets))
