@@ -68,7 +68,18 @@ def grid(decoded):
     }
 
 
+def states(decoded):
+    """The states by component; what changes from message to message is left out."""
+    return {"states": {of.name: [of.level, of.hardware_id, [v.key for v in of.values]] for of in decoded.status}}
+
+
+def cloud(decoded):
+    return {**of_header(decoded.header), "points": decoded.width}
+
+
 OF_TYPE = {
+    "diagnostic_msgs/msg/DiagnosticArray": states,
+    "sensor_msgs/msg/PointCloud2": cloud,
     "nav_msgs/msg/OccupancyGrid": grid,
     "visualization_msgs/msg/MarkerArray": markers,
     "geometry_msgs/msg/PoseArray": poses,
@@ -100,6 +111,13 @@ def main(endpoint, domain):
                 at, q = transform.transform.translation, transform.transform.rotation
                 frames = [transform.header.frame_id, transform.child_frame_id]
                 messages[topic] = {"frames": frames, "pose": [at.x, at.y, at.z, q.x, q.y, q.z, q.w]}
+                subscriber.undeclare()
+                continue
+            if not token["qos"].startswith("1:1:"):
+                # Not latched: the newest map is sent when the first subscriber comes.
+                samples = queue.Queue()
+                subscriber = session.declare_subscriber(key, samples.put)
+                messages[topic] = described(samples.get(timeout=60), name)
                 subscriber.undeclare()
                 continue
             # Nothing is published after the second subscriber comes, so its map is from the cache.

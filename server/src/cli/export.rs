@@ -21,8 +21,8 @@ use super::tool_commands::progress_bar;
 /// on the left, and under it the stamp, the sensors that are partial, the legend and a scale.
 ///
 /// foxglove and ros2 write one new MCAP file with the layers of every vehicle and the sensors' points: foxglove has
-/// coloured grids, scenes of the safe points and transforms, ros2 has occupancy grids (0 free, 100 occupied, -1
-/// unknown), markers and poses of the safe points, tf and odometry.
+/// coloured grids, scenes of the safe points and transforms, ros2 has occupancy grids (0 to 50 free, 100 occupied, -1
+/// unknown), clouds of obstacles and ground, markers and poses of the safe points, tf and odometry.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway export drive.mcap --layer freespace --format png --out maps

@@ -343,13 +343,13 @@ fn a_ros_2_file_has_occupancy_grids_tf_and_odometry() {
     let turned = poses[1]["orientation"]["z"].as_f64().unwrap();
     assert!((turned - std::f64::consts::FRAC_1_SQRT_2).abs() < 1e-9, "the second point lies to the left: {turned}");
     let grid = &topics["/clearway/alpha/drivability"]["last"];
-    assert_eq!(
-        grid["header"],
-        json!({"stamp": {"sec": 1_700_000_000, "nanosec": 300_000_000}, "frame_id": "alpha/base_link"})
-    );
-    assert_eq!((&grid["info"]["width"], &grid["info"]["resolution"]), (&json!(240), &json!(0.25)));
-    let at =
-        |x_m: f64, y_m: f64| grid["data"][((y_m + 30.0) * 4.0) as usize * 240 + ((x_m + 30.0) * 4.0) as usize].as_i64();
+    assert_eq!(grid["header"], json!({"stamp": {"sec": 1_700_000_000, "nanosec": 300_000_000}, "frame_id": "map"}));
+    let (info, corner) = (&grid["info"], &grid["info"]["origin"]["position"]);
+    assert_eq!((&info["resolution"], &info["origin"]["orientation"]["w"]), (&json!(0.25), &json!(1.0)));
+    // The vehicle stands at (4, 2) in `map` and heads along its y axis.
+    let index = |at_m: f64, axis: &str| ((at_m - corner[axis].as_f64().unwrap()) * 4.0) as u64;
+    let cell = |x_m: f64, y_m: f64| index(2.0 + x_m, "y") * info["width"].as_u64().unwrap() + index(4.0 - y_m, "x");
+    let at = |x_m: f64, y_m: f64| grid["data"][cell(x_m, y_m) as usize].as_i64();
     assert_eq!(at(6.1, 6.1), Some(0), "ahead and to the left: drivable");
     assert_eq!(at(-6.1, 6.1), Some(100), "behind and to the left: not drivable");
     assert_eq!(at(-6.1, -6.1), Some(-1), "behind and to the right: unknown");

@@ -137,7 +137,7 @@ impl<'a> TestBed<'a> {
             queue,
             events,
             engine,
-            vehicles: Vehicles(vec![Served { status, newest: receiver, wires }].into()),
+            vehicles: Vehicles(vec![Served::new(status, receiver, wires, None)].into()),
             maps: Vec::new(),
             taken: 0,
             epoch: 0,

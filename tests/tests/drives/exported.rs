@@ -1,6 +1,9 @@
 //! An exported bag is a drive again.
 
 use clearway_daemon::replay::ReplayOptions;
+use clearway_journal::reader::{RecordedMessage, RecordingReader};
+use clearway_ros::Kind;
+use clearway_ros::pose::Odometry;
 
 use super::scene::*;
 
@@ -15,6 +18,18 @@ async fn a_ros_2_export_replays_with_its_poses_rings_and_times() {
     };
     run(&["replay", "bag.mcap", "--record", "run.mcap"]);
     run(&["export", "run.mcap", "--format", "ros2", "--out", "exported.mcap"]);
+    let frames = |name: &str| {
+        let of_odometry = |message| match message {
+            RecordedMessage::Ros { kind: Kind::Odometry, bytes, .. } => {
+                let odometry = Odometry::new(&bytes).unwrap().transform;
+                Some([odometry.header.frame_id, odometry.child_frame_id].map(str::to_owned))
+            }
+            _ => None,
+        };
+        let found = RecordingReader::open(&at(name)).unwrap().map(Result::unwrap).find_map(of_odometry);
+        found.expect("an odometry")
+    };
+    assert_eq!(frames("exported.mcap"), ["odom", "base_link"], "as in the tf of the bag");
     let replayed =
         async |name: &str| replayed(ReplayOptions { files: vec![at(name)], ..Default::default() }).await.unwrap();
     let (before, expected) = replayed("bag.mcap").await;

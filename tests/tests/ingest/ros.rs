@@ -72,7 +72,11 @@ fn transform<'a>(stamp_ns: i64, parent: &'a str, child: &'a str, [x, y, z]: [f64
 }
 
 fn odometry(stamp_ns: i64) -> Vec<u8> {
-    let transform = transform(stamp_ns, "odom", "base_link", [7.0, 1.0, 0.0]);
+    odometry_in("odom", stamp_ns)
+}
+
+fn odometry_in(frame_id: &str, stamp_ns: i64) -> Vec<u8> {
+    let transform = transform(stamp_ns, frame_id, "base_link", [7.0, 1.0, 0.0]);
     let twist = Some(Twist { linear_mps: [0.5, 0.0, 0.0], angular_rps: [0.0; 3] });
     Odometry { transform, twist }.to_cdr()
 }
@@ -333,21 +337,22 @@ async fn live_topics_of_rmw_zenoh_make_maps_and_bad_messages_are_counted() {
         let sequence = if last { sequence + 2 } else { sequence };
         cloud.put(revolution.clone()).attachment(attachment(sequence)).await.unwrap();
     }
-    // A message of another type, and bytes that are no message.
+    // A message of another type, bytes that are no message, and a pose in another frame than the configured one.
     string.put(vec![0, 1, 0, 0]).await.unwrap();
     odom.put(vec![0, 1, 0, 0, 1]).attachment(vec![1, 2, 3]).await.unwrap();
+    odom.put(odometry_in("map", revolutions[0].0)).await.unwrap();
     let n = revolutions.len() as u64;
     until("all is taken or refused", || {
         let snapshot = status.snapshot();
         let ledger = &snapshot.ledger;
         // The newest map is counted after its scan.
-        snapshot.maps >= n && ledger.poses == n && ledger.refused.get("observation") == Some(&2)
+        snapshot.maps >= n && ledger.poses == n && ledger.refused.get("observation") == Some(&3)
     })
     .await;
     let snapshot = status.snapshot();
     assert_eq!((snapshot.maps, snapshot.ledger.decoded, snapshot.ledger.lost), (n, n, 2));
-    assert_eq!(snapshot.ledger.refused["observation"], 2);
-    assert_eq!(snapshot.observations_refused, [("ros_message", 1), ("ros_type", 1)].into());
+    assert_eq!(snapshot.ledger.refused["observation"], 3);
+    assert_eq!(snapshot.observations_refused, [("ros_frame", 1), ("ros_message", 1), ("ros_type", 1)].into());
     // The refused odometry belongs to no sensor.
     assert_eq!(snapshot.sensors[0].ledger.refused["observation"], 1);
     assert!(snapshot.drivable_share.unwrap() > 0.3);

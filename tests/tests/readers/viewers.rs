@@ -8,20 +8,28 @@ use std::process::Stdio;
 use clearway_client::{MapView, SafePoint};
 use clearway_daemon::config::{Config, Foxglove, Ros2};
 use clearway_daemon::encode::viewer::Raster;
+use clearway_daemon::encode::viewer::aligned::AlignedGrid;
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::run::{Running, Server, Setup};
 use clearway_mapping::event::{Body, EgoPose};
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::sample::Sample;
+use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig};
 
 use crate::fixture::{LAYERS, config, feed, readings, start, venv, within};
+
+/// A pose that heads north-east.
+fn pose() -> Isometry3<f64> {
+    Isometry3::new(Vector3::new(7.0, -3.0, 0.5), Vector3::z() * FRAC_PI_4)
+}
 
 /// Sends poses of a vehicle at rest that heads north-east, from 0.2 s before the readings to 0.2 s after them.
 async fn send_poses(running: &Running, readings: &[Reading]) {
     let (first_ns, last_ns) = (readings[0].arrival_ns, readings[readings.len() - 1].arrival_ns);
-    let map_from_ego = Isometry3::new(Vector3::new(7.0, -3.0, 0.5), Vector3::z() * FRAC_PI_4);
     let pose = |stamp_ns| {
-        let body = Body::EgoPose(EgoPose { stamp_ns, map_from_ego, speed_mps: 0.0 });
+        let body = Body::EgoPose(EgoPose { stamp_ns, map_from_ego: pose(), speed_mps: 0.0 });
         Reading { arrival_ns: first_ns, source: 0, body }
     };
     let poses: Vec<_> = (first_ns - 200_000_000..last_ns + 200_000_000).step_by(50_000_000).map(pose).collect();
@@ -38,7 +46,9 @@ fn newest(running: &Running) -> MapView {
 fn ros2() -> Config {
     let mut config = config();
     config.zenoh.enabled = true;
-    config.zenoh.ros2 = Ros2 { enabled: true, domain: 7, ..Ros2::default() };
+    config.zenoh.ros2 = Ros2 { enabled: true, domain: 7, tf: true, ..Ros2::default() };
+    // The test compares the grids of the newest map, long after its last scan.
+    config.vehicles[0].maps.valid_ms = 60_000;
     config
 }
 
@@ -67,22 +77,39 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
 
     let map = newest(&running);
     assert_eq!(map.layers().len() as u64, LAYERS);
-    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 4);
+    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 7);
     assert_eq!(received["messages"]["/clearway/car/replay_ended"]["data"], true);
+    let states = &received["messages"]["/diagnostics"]["states"];
+    let known = states["clearway: car"].as_array().expect("a state of car");
+    assert_eq!(json!(known[1..]), json!(["car", ["map_age_ms", "map_rate_hz", "loss"]]));
+    for cloud in ["obstacles", "ground"] {
+        let topic = format!("/clearway/car/freespace/{cloud}");
+        let message = &received["messages"][&topic];
+        assert_eq!(received["topics"][&topic]["qos"], "1:2:1,100:,:,:,,", "{topic}");
+        assert_eq!(
+            (&message["frame_id"], &message["stamp_ns"]),
+            (&json!("car/base_link"), &json!(map.header().capture_end_ns))
+        );
+        assert_eq!(message["points"].as_u64().unwrap() > 100, cloud == "ground", "a plain: {message}");
+    }
     let mut gids = Vec::new();
     for layer in map.layers() {
         let topic = format!("/clearway/car/{}", layer.name);
         assert_eq!(received["topics"][&topic]["qos"], "1:1:1,1:,:,:,,", "{topic}");
         let (grid, raster) = (&received["messages"][&topic], Raster::from_grid(&layer.grid));
-        assert_eq!(grid["frame_id"], "car/base_link", "{topic}");
+        let placed = AlignedGrid::new(&raster, &raster.occupancies(layer), &pose());
+        assert_eq!(grid["frame_id"], "map", "{topic}");
         assert_eq!(grid["stamp_ns"], map.header().capture_end_ns, "{topic}");
-        assert_eq!(grid["size"], json!([raster.width, raster.height]), "{topic}");
+        assert_eq!(grid["size"], json!([placed.width, placed.height]), "{topic}");
+        assert_near(&grid["origin"], &[placed.origin_m[0], placed.origin_m[1], 0.0, 1.0]);
         assert_eq!(grid["sequence"], 1, "{topic}: the second subscriber has it from the cache");
-        assert_eq!(grid["data"], json!(raster.occupancies(layer)), "{topic}");
-        assert!(
-            grid["data"].as_array().unwrap().contains(&json!(0)),
-            "{topic}: the map has clear ground around a vehicle on a plain"
-        );
+        // The grades of free cells are the clearance, and other cells have none.
+        let data: Vec<i64> = grid["data"].as_array().unwrap().iter().map(|value| value.as_i64().unwrap()).collect();
+        let graded = data.iter().any(|value| (1..=50).contains(value));
+        assert_eq!(graded, layer.name == "freespace", "{topic}");
+        let classes = data.iter().map(|&value| if (1..=50).contains(&value) { 0 } else { value as i8 });
+        assert!(classes.eq(placed.occupancies), "{topic}");
+        assert!(data.contains(&0), "{topic}: the map has clear ground around a vehicle on a plain");
         gids.push(grid["gid"].as_str().unwrap());
     }
     let points = &map.layer("safe_path").unwrap().points;
@@ -105,12 +132,55 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
     gids.sort_unstable();
     gids.dedup();
     assert_eq!(gids.len() as u64, LAYERS + 2, "each publisher has its own gid");
-    // The axes of the occupancy grid are those of the world, so the grid is rotated in the vehicle's frame.
     let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
-    let origin = received["messages"]["/clearway/car/occupancy"]["origin"].as_array().unwrap();
-    assert_near(&json!(origin[2..]), &[sin, cos]);
     assert_eq!(received["messages"]["/tf"]["frames"], json!(["map", "car/base_link"]));
     assert_near(&received["messages"]["/tf"]["pose"], &[7.0, -3.0, 0.5, 0.0, 0.0, -sin, cos]);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_grid_of_a_sensor_that_stops_becomes_unknown_once_and_a_late_subscriber_gets_no_other() {
+    let mut config = ros2();
+    // No grid takes so long to make.
+    config.vehicles[0].maps.valid_ms = 3000;
+    config.zenoh.ros2.dds_bridge = true;
+    let running = start(config).await;
+    let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
+    let mut client = zenoh::Config::default();
+    client.insert_json5("mode", "\"client\"").unwrap();
+    client.insert_json5("connect/endpoints", &format!("[{endpoint:?}]")).unwrap();
+    client.insert_json5("scouting/multicast/enabled", "false").unwrap();
+    let session = within("zenoh", zenoh::open(client).into_future()).await.unwrap();
+    let subscribe = async || {
+        let history = HistoryConfig::default().detect_late_publishers();
+        session.declare_subscriber("clearway/car/freespace").history(history).await.unwrap()
+    };
+    // Stamp in ns, and whether the grid has a known cell.
+    let next = async |subscriber: &AdvancedSubscriber<FifoChannelHandler<Sample>>| {
+        let sample = within("a grid", subscriber.recv_async()).await.unwrap();
+        let message = sample.payload().to_bytes();
+        let stamp_ns = clearway_ros::cdr::Reader::new(&message).unwrap().header().unwrap().stamp_ns;
+        // Header, info and count end before the cells, of which the last are in a corner.
+        let known = message[200..].iter().any(|&value| value != u8::MAX);
+        (stamp_ns, known)
+    };
+    let first = subscribe().await;
+    let mut fed = readings(4);
+    let rest = fed.split_off(fed.len() / 2);
+    feed(&running, fed).await;
+    let (mut known_ns, mut grid) = (0, next(&first).await);
+    while grid.1 {
+        (known_ns, grid) = (grid.0, next(&first).await);
+    }
+    assert_eq!(grid.0, known_ns + 3_000_000_000, "the time at which the newest map became stale");
+    let late = subscribe().await;
+    assert_eq!(next(&late).await, grid);
+    feed(&running, rest).await;
+    for subscriber in [&first, &late] {
+        let (stamp_ns, known) = next(subscriber).await;
+        assert!(known && stamp_ns > known_ns, "the unknown grid came once");
+    }
+    session.close().await.unwrap();
     within("shutdown", running.shutdown()).await.unwrap();
 }
 

@@ -1,4 +1,4 @@
-//! The table `[vehicle.ros]`: which ROS 2 topics feed a vehicle.
+//! The table `[vehicle.ros]`: which ROS 2 topics feed a vehicle, and the names of its frames.
 
 use std::collections::BTreeMap;
 
@@ -18,9 +18,9 @@ pub struct Ros {
     pub domain: u32,
     /// Topic of odometry or stamped poses; empty: poses come from tf.
     pub pose: String,
-    /// Frame in which tf gives the vehicle's pose, if `pose` is empty; empty: no poses.
+    /// Frame of the poses, of the topic `pose` or of tf, and of the grids that are published; empty: no poses.
     pub fixed_frame: String,
-    /// The vehicle's own frame, with its origin on the ground.
+    /// The vehicle's own frame, with its origin on the ground, here and in what is published.
     pub ego_frame: String,
     /// Topic of moving transforms; empty: no subscription.
     pub tf: String,
@@ -45,9 +45,18 @@ impl Default for Ros {
 }
 
 impl Ros {
+    /// The frames without the topics: for events from files.
+    pub(crate) fn frames_alone(self) -> Self {
+        let Self { fixed_frame, ego_frame, .. } = self;
+        let (pose, tf, tf_static, sensors) = Default::default();
+        Self { domain: 0, pose, fixed_frame, ego_frame, tf, tf_static, sensors }
+    }
+
     /// Checks the values; the keys of errors start behind `vehicle.`.
     pub(super) fn check(&self, zenoh_enabled: bool, sensors: &[SensorConfig]) -> Result<(), ValueError> {
-        if !zenoh_enabled {
+        let topics = self.sensors.values().chain([&self.pose, &self.tf, &self.tf_static]);
+        let mut named: Vec<_> = topics.filter(|topic| !topic.is_empty()).collect();
+        if !zenoh_enabled && !named.is_empty() {
             let allowed = "only with zenoh.enabled = true, because ROS topics come through zenoh";
             return Err(ValueError::new("ros", "(set)", allowed));
         }
@@ -59,8 +68,6 @@ impl Ros {
             let allowed = format!("the vehicle's sensors: {}", known.join(", "));
             return Err(ValueError::new("ros.sensors", unknown, allowed));
         }
-        let topics = self.sensors.values().chain([&self.pose, &self.tf, &self.tf_static]);
-        let mut named: Vec<_> = topics.filter(|topic| !topic.is_empty()).collect();
         if let Some(topic) = named.iter().find(|topic| !is_topic(topic)) {
             return Err(ValueError::new("ros", topic, "topics such as \"/sensing/top/points\""));
         }

@@ -1,34 +1,39 @@
-//! Maps as ROS 2 topics in rmw_zenoh's key space, without a bridge.
+//! Maps as ROS 2 topics in the key space of rmw_zenoh, or of zenoh-bridge-ros2dds.
 //!
-//! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`), of the layer `safe_path` also
-//! `.../safe_path/markers` (`visualization_msgs/msg/MarkerArray`) and `.../safe_path/poses`
-//! (`geometry_msgs/msg/PoseArray`), and `<namespace>/<vehicle>/replay_ended` (`std_msgs/msg/Bool`: true from the end of
-//! a replay until it is set back), all reliable, transient local, depth 1; and its pose in `map` on `/tf` (reliable,
-//! volatile). A topic is published under `<domain>/<topic>/<type>/<hash>`,
-//! the payload CDR, with an attachment: sequence, time of sending, length 16, the publisher's 16 bytes. Liveliness
-//! tokens under `@ros2_lv` announce the node and its publishers. A message is made only while there is a subscriber;
-//! the first subscriber gets the newest map at once, later ones get it from the publisher's cache.
+//! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the other topics of the layer
+//! ([`ros::topics_of`]), `<namespace>/<vehicle>/replay_ended` (`std_msgs/msg/Bool`: true from the end of a replay until
+//! it is set back), and if configured its pose on `/tf`. For all: their states on `/diagnostics`
+//! (`diagnostic_msgs/msg/DiagnosticArray`). All are reliable; clouds, `/tf` and states volatile, the others transient
+//! local with depth 1. rmw_zenoh has a topic under `<domain>/<topic>/<type>/<hash>`, and liveliness tokens under
+//! `@ros2_lv` announce the node and its publishers; the bridge has it under `<topic>`. The payload is CDR, with an
+//! attachment: sequence, time of sending, length 16, the publisher's 16 bytes.
+//!
+//! A message is made only while there is a subscriber; the first subscriber gets the newest map at once, later ones get
+//! it from the publisher's cache. When the newest map becomes stale, its grids are sent once more, unknown, so that no
+//! cache keeps one that looks fresh.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
 use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{ros, safe_paths, view};
-use clearway_client::Layer;
-use clearway_client::MapView;
-use clearway_ros::cdr::Writer;
-use clearway_ros::published::{BOOL, MARKER_ARRAY, OCCUPANCY_GRID, POSE_ARRAY, Published, TF_MESSAGE};
+use crate::encode::viewer::ros::{self, LayerTopic, ShownLayer};
+use crate::encode::viewer::view;
+use clearway_ros::cdr::{Header, Writer};
+use clearway_ros::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
+use clearway_ros::published::{BOOL, DIAGNOSTIC_ARRAY, Published, TF_MESSAGE};
 use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep_until};
 use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::qos::CongestionControl;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
-use super::served::Served;
+use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
 use crate::config::Ros2;
-use crate::status::{Reader, Transport};
+use crate::status::assess::Assessment;
+use crate::status::{Reader, State, Transport, VehicleStatus, state_changed};
 use crate::zenoh_session::ZenohError;
 use clearway_journal::encode::EncodedMap;
 
@@ -37,10 +42,12 @@ const NODE: &str = "clearway";
 /// QoS of the grids: reliability 1 reliable; durability 1 transient local; history 1 keep last, depth 1; deadline,
 /// lifespan and liveliness by default.
 const LATCHED: &str = "1:1:1,1:,:,:,,";
-/// QoS of `/tf`: the same, but durability 2 volatile, depth 100, as tf2's broadcaster has it.
+/// QoS of clouds and `/tf`: the same, but durability 2 volatile, depth 100, as tf2's broadcaster has it.
 const MOVING: &str = "1:2:1,100:,:,:,,";
 /// Interval at which a quiet publisher repeats its last sequence, so that subscribers notice a lost last map.
 const HEARTBEAT: Duration = Duration::from_secs(1);
+/// Interval at which the states of the vehicles are published, as ROS 2's diagnostic updater has it.
+const STATES_PERIOD: Duration = Duration::from_secs(1);
 
 /// The node of the topics of all vehicles.
 pub(super) struct Node<'a> {
@@ -62,44 +69,64 @@ impl<'a> Node<'a> {
     pub async fn publish(&mut self, served: &Served, tasks: &mut JoinSet<()>) -> Result<(), ZenohError> {
         let vehicle = &served.status.name;
         for &layer in &served.status.layers {
-            let topic = format!("{}/{vehicle}/{layer}", self.options.namespace);
-            let mut rasters = Rasters::default();
-            let grid = move |map: &MapView, layer: &Layer| ros::occupancy_grid(map, layer, rasters.of(layer));
-            self.publish_layer(served, layer, (&topic, &OCCUPANCY_GRID), grid, tasks).await?;
-            if layer == safe_paths::LAYER {
-                let (markers, poses) = (format!("{topic}/markers"), format!("{topic}/poses"));
-                self.publish_layer(served, layer, (&markers, &MARKER_ARRAY), ros::safe_path_markers, tasks).await?;
-                self.publish_layer(served, layer, (&poses, &POSE_ARRAY), ros::safe_point_poses, tasks).await?;
+            for topic in ros::topics_of(layer) {
+                self.publish_layer(served, layer, topic, tasks).await?;
             }
         }
-        let tf = self.topic("/tf", &TF_MESSAGE, MOVING).await?;
-        let transform = |map: &EncodedMap| {
-            let map = view(map, map.header.clone())?;
-            ros::tf(&map)
-        };
-        tasks.spawn(tf.publish(served.clone(), None, transform));
+        if self.options.tf {
+            let tf = self.topic("/tf", &TF_MESSAGE, MOVING).await?;
+            let frames = served.frames.clone();
+            let transform = move |map: &EncodedMap, is_fresh: bool| {
+                let pose = ros::pose_of(&view(map, map.header.clone())?).filter(|_| is_fresh)?;
+                Some(ros::tf_of(&frames, &pose))
+            };
+            tasks.spawn(tf.publish(served.clone(), None, transform));
+        }
         let topic = format!("{}/{vehicle}/replay_ended", self.options.namespace);
         tasks.spawn(self.topic(&topic, &BOOL, LATCHED).await?.publish_replay_end(served.clone()));
         Ok(())
     }
 
-    /// Publishes a message of each newest map's layer on a topic of this name and type.
+    /// Publishes a message of each newest map's layer on one of the layer's topics.
     async fn publish_layer(
         &mut self,
         served: &Served,
         layer: &'static str,
-        (topic, kind): (&str, &Published),
-        mut write: impl FnMut(&MapView, &Layer) -> Vec<u8> + Send + 'static,
+        LayerTopic { ending, kind, is_latched, write }: &'static LayerTopic,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ZenohError> {
-        let topic = self.topic(topic, kind, LATCHED).await?;
-        let message = move |map: &EncodedMap| {
+        let name = format!("{}/{}/{layer}{ending}", self.options.namespace, served.status.name);
+        let topic = self.topic(&name, kind, if *is_latched { LATCHED } else { MOVING }).await?;
+        let (mut rasters, frames) = (Rasters::default(), served.frames.clone());
+        let message = move |map: &EncodedMap, is_fresh: bool| {
             let (_, chunk) = map.layers.iter().find(|(name, _)| *name == layer)?;
             let map = view(map, map.layer(chunk))?;
             let layer = map.layers().first()?;
-            Some(write(&map, layer))
+            write(&ShownLayer { map: &map, layer, raster: rasters.of(layer), frames: &frames, is_fresh })
         };
         tasks.spawn(topic.publish(served.clone(), Some(layer), message));
+        Ok(())
+    }
+
+    /// Publishes the states of the vehicles on `/diagnostics`, once a second and when one changes.
+    pub async fn publish_states(&mut self, vehicles: &Vehicles, tasks: &mut JoinSet<()>) -> Result<(), ZenohError> {
+        let mut topic = self.topic("/diagnostics", &DIAGNOSTIC_ARRAY, MOVING).await?;
+        let statuses = vehicles.statuses();
+        tasks.spawn(async move {
+            let mut every = tokio::time::interval(STATES_PERIOD);
+            let mut states: Vec<_> = statuses.iter().map(|status| status.states()).collect();
+            loop {
+                tokio::select! {
+                    _ = every.tick() => {}
+                    () = state_changed(&mut states) => {}
+                }
+                if topic.publisher.matching_status().await.is_ok_and(|status| status.matching()) {
+                    let states: Vec<_> = statuses.iter().map(|status| diagnostic(status)).collect();
+                    let header = Header { stamp_ns: now_ns(), frame_id: "" };
+                    topic.put(Some(diagnostic_array_to_cdr(&header, &states))).await;
+                }
+            }
+        });
         Ok(())
     }
 
@@ -111,14 +138,20 @@ impl<'a> Node<'a> {
     async fn declare_token(&mut self, entity: &str) -> Result<String, ZenohError> {
         // The node is entity 0 of its session.
         let key = format!("@ros2_lv/{}/{}/0/{entity}", self.options.domain, self.session.zid());
-        let token = self.session.liveliness().declare_token(key.clone());
-        self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness {key}")))?);
+        if !self.options.dds_bridge {
+            let token = self.session.liveliness().declare_token(key.clone());
+            self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness {key}")))?);
+        }
         Ok(key)
     }
 
     async fn topic(&mut self, topic: &str, kind: &Published, qos: &str) -> Result<Topic, ZenohError> {
         let (name, hash) = (kind.dds_name(), kind.hash);
-        let key = format!("{}/{}/{name}/{hash}", self.options.domain, topic.trim_start_matches('/'));
+        let plain = topic.trim_start_matches('/');
+        let key = match self.options.dds_bridge {
+            true => plain.to_owned(),
+            false => format!("{}/{plain}/{name}/{hash}", self.options.domain),
+        };
         // Not to this session: a vehicle may get its own poses from the same /tf.
         let publisher = self.session.declare_publisher(key.clone()).allowed_destination(Locality::Remote);
         let publisher = publisher.congestion_control(CongestionControl::Drop);
@@ -133,6 +166,25 @@ impl<'a> Node<'a> {
         let (id, mangled) = (self.tokens.len(), topic.replace('/', "%"));
         let token = self.declare_token(&format!("{id}/MP/%/%/{NODE}/{mangled}/{name}/{hash}/{qos}")).await?;
         Ok(Topic { publisher, gid: gid(&token), sent: 0 })
+    }
+}
+
+/// The state of a vehicle: its reasons, worst first, and what an operator reads first.
+fn diagnostic(status: &VehicleStatus) -> Diagnostic {
+    let Assessment { state, reasons, map_age_ms, loss, .. } = status.assess();
+    let level = match state {
+        State::Ok => DiagnosticLevel::Ok,
+        State::Warn => DiagnosticLevel::Warn,
+        State::Error => DiagnosticLevel::Error,
+    };
+    let age = map_age_ms.map_or_else(|| "no map".to_owned(), |age_ms| format!("{age_ms:.0}"));
+    let rate = format!("{:.1}", status.snapshot().map_rate_hz);
+    Diagnostic {
+        level,
+        name: format!("{NODE}: {}", status.name),
+        message: reasons.join("; "),
+        hardware_id: status.name.to_string(),
+        values: vec![("map_age_ms", age), ("map_rate_hz", rate), ("loss", format!("{loss:.3}"))],
     }
 }
 
@@ -157,12 +209,13 @@ struct Topic {
 }
 
 impl Topic {
-    /// Sends the message of each newest map while there is a subscriber, and keeps the layer active meanwhile.
+    /// Sends the message of each newest map while there is a subscriber, and keeps the layer active meanwhile. When
+    /// that map becomes stale, sends its message as a stale one, once.
     async fn publish(
         mut self,
         served: Served,
         layer: Option<&'static str>,
-        mut make: impl FnMut(&EncodedMap) -> Option<Vec<u8>> + Send,
+        mut make: impl FnMut(&EncodedMap, bool) -> Option<Vec<u8>> + Send,
     ) {
         let Ok(matching) = self.publisher.matching_listener().await else { return };
         let mut newest = served.newest.clone();
@@ -177,21 +230,30 @@ impl Topic {
             let _subscription = layer.map(|layer| served.wires.subscriptions.subscribe(&[layer.to_owned()]));
             let mut reader = Reader::new(&served.status.transports, Transport::Ros);
             newest.mark_changed();
+            // When the newest map becomes stale; `None` if there is none, or once that is said.
+            let (mut stale_at, mut is_said) = (None, false);
+            let mut is_stopped = false;
             loop {
                 tokio::select! {
-                    changed = newest.changed() => match changed {
-                        Ok(()) => {
-                            let map = newest.borrow_and_update().clone();
-                            map.iter().for_each(|map| _ = reader.got(map.boot_id, map.sequence));
-                            let trace = |map: &EncodedMap| served.status.traces.hop(map, "send", Some(Transport::Ros.as_str()));
-                            let _hop = map.as_deref().map(trace);
-                            if let Some(message) = map.and_then(|map| make(&map)) {
-                                self.put(message).await;
-                            }
+                    changed = newest.changed(), if !is_stopped => {
+                        // The engine has stopped: its newest map becomes stale like any other.
+                        is_stopped = changed.is_err();
+                        let Some(map) = newest.borrow_and_update().clone().filter(|_| !is_stopped) else { continue };
+                        reader.got(map.boot_id, map.sequence);
+                        let _hop = served.status.traces.hop(&map, "send", Some(Transport::Ros.as_str()));
+                        let fresh_for = served.status.fresh_for(map.capture_end_ns);
+                        // Maps that are stale when they are made say so once, until one is fresh.
+                        if !fresh_for.is_zero() {
+                            self.put(make(&map, true)).await;
+                            is_said = false;
                         }
-                        // The engine has stopped; the newest map stays in the cache until the session ends.
-                        Err(_) => return std::future::pending().await,
-                    },
+                        stale_at = (!is_said).then(|| Instant::now() + fresh_for);
+                    }
+                    () = sleep_until(stale_at.unwrap_or_else(Instant::now)), if stale_at.is_some() => {
+                        (stale_at, is_said) = (None, true);
+                        let map = newest.borrow().clone();
+                        self.put(map.and_then(|map| make(&map, false))).await;
+                    }
                     status = matching.recv_async() => match status {
                         Ok(status) if status.matching() => {}
                         Ok(_) => break,
@@ -209,14 +271,16 @@ impl Topic {
             let has_ended = *ended.borrow_and_update();
             let mut message = Writer::default();
             message.bytes(&[has_ended.into()]);
-            self.put(message.finish()).await;
+            self.put(Some(message.finish())).await;
             if ended.changed().await.is_err() {
                 return std::future::pending().await;
             }
         }
     }
 
-    async fn put(&mut self, message: Vec<u8>) {
+    /// Sends a message, if there is one.
+    async fn put(&mut self, message: Option<Vec<u8>>) {
+        let Some(message) = message else { return };
         self.sent += 1;
         let attachment = [&self.sent.to_le_bytes()[..], &now_ns().to_le_bytes(), &[16], &self.gid].concat();
         if let Err(error) = self.publisher.put(message).attachment(attachment).await {

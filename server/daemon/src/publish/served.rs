@@ -5,6 +5,8 @@ use std::sync::Arc;
 use tokio::sync::watch;
 
 use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
+use crate::config::Ros;
+use crate::encode::viewer::FrameNames;
 use crate::engine::newest::Newest;
 use crate::engine::wires::Wires;
 use crate::status::VehicleStatus;
@@ -18,6 +20,8 @@ pub struct Served {
     pub newest: watch::Receiver<Newest>,
     /// The other channels to the vehicle's engine.
     pub wires: Wires,
+    /// The vehicle's frames in ROS 2.
+    pub frames: FrameNames,
 }
 
 /// All vehicles, in the order of the configuration.
@@ -52,6 +56,12 @@ impl Vehicles {
 }
 
 impl Served {
+    /// A vehicle with the frames of its table `[vehicle.ros]`, if it has one.
+    pub fn new(status: Arc<VehicleStatus>, newest: watch::Receiver<Newest>, wires: Wires, ros: Option<&Ros>) -> Self {
+        let frames = FrameNames::new(&status.name, ros);
+        Self { status, newest, wires, frames }
+    }
+
     /// Checks that the vehicle's maps have all these layers.
     ///
     /// # Errors

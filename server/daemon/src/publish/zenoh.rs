@@ -92,6 +92,7 @@ impl Publisher {
             for served in vehicles.0.iter() {
                 node.publish(served, &mut publisher.tasks).await?;
             }
+            node.publish_states(vehicles, &mut publisher.tasks).await?;
             publisher.tokens.append(&mut node.into_tokens());
         }
         Ok(publisher)

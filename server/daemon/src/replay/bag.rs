@@ -7,6 +7,7 @@ use nalgebra::Isometry3;
 
 use super::error::ReplayError;
 use super::summary::Mount;
+use crate::config::Ros;
 use crate::ingest::files::FilesError;
 use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::ros::available::AvailableTopics;
@@ -35,6 +36,12 @@ pub(super) fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
         true => sensors.retain(&mut known),
         false => sensors.truncate(1),
     }
+}
+
+/// The frames of a ROS bag, for what is published of it.
+pub(super) fn frames_of(choice: &TopicChoice) -> Ros {
+    let (ego_frame, fixed_frame) = (choice.ego_frame.clone(), choice.fixed_frame.clone());
+    Ros { ego_frame, fixed_frame, ..Ros::default() }.frames_alone()
 }
 
 /// The configuration of each sensor of a ROS bag, and its mount if tf has it. A single sensor is named `top`, several

@@ -15,12 +15,12 @@ use clearway_mapping::scan_file::ScanFormat;
 use clearway_mapping::sensor::mount::estimate;
 use nalgebra::{Isometry3, Point3, Vector3};
 
-use super::bag::{choice, extrinsics_of, keep_placed, sensors_of};
+use super::bag::{choice, extrinsics_of, frames_of, keep_placed, sensors_of};
 use super::error::ReplayError;
 use super::options::ReplayOptions;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
-use crate::config::{Calibrations, Config, Origin, Recorder};
+use crate::config::{Calibrations, Config, Origin, Recorder, Ros};
 use crate::ingest::files::ground_revolutions::{GroundRevolutions, points_of};
 use crate::ingest::files::mcap::McapOptions;
 use crate::ingest::files::{Kind, Readings};
@@ -66,7 +66,7 @@ pub(super) fn plan(options: &ReplayOptions) -> Result<ReplayPlan, ReplayError> {
     }
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];
-    (vehicle.udp, vehicle.ros) = (None, None);
+    (vehicle.udp, vehicle.ros) = (None, vehicle.ros.take().map(Ros::frames_alone));
     let mut wanted = McapOptions {
         vehicle: options.vehicle.clone(),
         topics: options.topics.clone(),
@@ -111,7 +111,7 @@ fn plan_several(options: &ReplayOptions, recordings: Vec<Recorded>, bytes: u64) 
     let mut tracks: Vec<Track> = Vec::new();
     for Recorded { file, config, tables, .. } in recordings {
         for (mut vehicle, tables) in config.vehicles.into_iter().zip(tables) {
-            (vehicle.udp, vehicle.ros) = (None, None);
+            (vehicle.udp, vehicle.ros) = (None, vehicle.ros.take().map(Ros::frames_alone));
             match known.config.vehicles.iter().position(|before| before.name == vehicle.name) {
                 Some(index) if known.config.vehicles[index] != vehicle => {
                     let name = &vehicle.name;
@@ -224,7 +224,7 @@ impl KnownVehicle {
         }
         let (sensors, mounts) = sensors_of(&choice);
         sensors.iter().zip(&mounts).for_each(|(sensor, mount)| self.remark(&sensor.name, mount.as_ref()));
-        self.config.vehicles[0].sensors = sensors;
+        (self.config.vehicles[0].sensors, self.config.vehicles[0].ros) = (sensors, Some(frames_of(&choice)));
         Ok(mounts.into_iter().next().flatten())
     }
 

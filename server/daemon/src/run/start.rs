@@ -147,7 +147,7 @@ impl Running {
             replayed: None,
         };
         self.inputs.push(VehicleInput { name, queue, udp: None });
-        Prepared { served: Served { status, newest: receiver, wires }, engine, events, core }
+        Prepared { served: Served::new(status, receiver, wires, vehicle.ros.as_ref()), engine, events, core }
     }
 
     async fn start_all(
@@ -453,7 +453,7 @@ mod tests {
         let Listeners { grpc, handles, .. } = bound.expect("a free port");
         let status = VehicleStatus::new("car".into(), 1, Vec::new(), event_queue(1).0.drops());
         let (status, (_, newest)) = (Arc::new(status), watch::channel(None));
-        let vehicles = Vehicles([Served { status: status.clone(), newest, wires: Wires::new(&[]) }].into());
+        let vehicles = Vehicles([Served::new(status.clone(), newest, Wires::new(&[]), None)].into());
         let watching = tokio::spawn(watch_listeners((security, handles.clone()), vehicles, pending()));
 
         let of_listener = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();

@@ -71,6 +71,18 @@ impl VehicleStatus {
         self.health_state.subscribe()
     }
 
+    /// Time until the newest map, whose capture ended then, is stale; 0 if it is. The stamp of a recorded map says
+    /// nothing about now, so that its age counts from its publication.
+    pub(crate) fn fresh_for(&self, capture_end_ns: i64) -> Duration {
+        let state = locked(&self.changing);
+        let age = if state.has_recorded_stamps {
+            self.started.elapsed().saturating_sub(state.mapped_at)
+        } else {
+            Duration::from_nanos(now_ns().saturating_sub(capture_end_ns).max(0).unsigned_abs())
+        };
+        state.validity.saturating_sub(age)
+    }
+
     /// Assesses the vehicle now.
     pub fn assess(&self) -> Assessment {
         let mut health = locked(&self.health);

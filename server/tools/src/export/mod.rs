@@ -174,9 +174,10 @@ pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Re
     options.check_layers()?;
     let styles = options.channel_styles()?;
     let mut recording = McapReader::open(file)?;
+    let create = |dialect| ViewerFile::create(out, dialect, options.with_points, recording.header());
     let mut viewer = match options.format {
-        ExportFormat::Foxglove => Some(ViewerFile::create(out, Dialect::Foxglove, options.with_points)?),
-        ExportFormat::Ros2 => Some(ViewerFile::create(out, Dialect::Ros2, options.with_points)?),
+        ExportFormat::Foxglove => Some(create(Dialect::Foxglove)?),
+        ExportFormat::Ros2 => Some(create(Dialect::Ros2)?),
         _ => None,
     };
     let (mut exported, mut vehicles) = (Exported::default(), BTreeSet::new());

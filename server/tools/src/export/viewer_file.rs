@@ -2,8 +2,7 @@
 //!
 //! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`),
 //! `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf` (`foxglove.FrameTransforms`). ros2:
-//! `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`), `/clearway/<vehicle>/safe_path/markers`
-//! (`visualization_msgs/msg/MarkerArray`) and `.../poses` (`geometry_msgs/msg/PoseArray`),
+//! `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the layer's other topics ([`ros::topics_of`]),
 //! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
 //! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording,
 //! and the stamp of the capture's or the scan's end. With points the poses of ros2 are the recorded ones with their own
@@ -16,17 +15,18 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use clearway_client::{Layer, MapView, v1};
+use clearway_daemon::config::Ros;
 use clearway_daemon::encode::viewer::frame::isometry;
 use clearway_daemon::encode::viewer::raster::Rasters;
-use clearway_daemon::encode::viewer::{base_frame, foxglove as messages, ros, safe_paths};
+use clearway_daemon::encode::viewer::ros::ShownLayer;
+use clearway_daemon::encode::viewer::{FrameNames, base_frame, foxglove as messages, ros, safe_paths};
 use clearway_mapping::event::EgoPose;
-use clearway_ros::published::{
-    MARKER_ARRAY, OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, POSE_ARRAY, Published, TF_MESSAGE,
-};
+use clearway_ros::published::{ODOMETRY, POINT_CLOUD2, Published, TF_MESSAGE};
 use foxglove::Encode;
 use foxglove::messages::FrameTransforms;
 use mcap::records::MessageHeader;
 use prost::Message as _;
+use serde::Deserialize;
 
 use super::scans::{DecodedScan, ScanDecoder, ScanPoints};
 use clearway_daemon::base::files;
@@ -51,6 +51,8 @@ pub struct ViewerFile {
     /// The id of each topic's channel and the sequence number of its newest message, by topic.
     channels: HashMap<String, (u16, u32)>,
     rasters: BTreeMap<String, Rasters>,
+    /// The frames of each vehicle whose input has names for them.
+    frames: BTreeMap<String, FrameNames>,
     /// Stamp of the newest map whose pose is written, by vehicle.
     placed: HashMap<String, i64>,
     /// Names of the vehicles whose recorded poses are written.
@@ -61,11 +63,11 @@ pub struct ViewerFile {
 }
 
 impl ViewerFile {
-    /// Creates the file.
+    /// Creates the file for the maps of a recording with this header.
     ///
     /// # Errors
     /// If the file exists or cannot be written.
-    pub fn create(file: &Path, dialect: Dialect, with_points: bool) -> Result<Self> {
+    pub fn create(file: &Path, dialect: Dialect, with_points: bool, recording: &Header) -> Result<Self> {
         let open = files::create_new(file)?;
         let profile = if dialect == Dialect::Ros2 { "ros2" } else { "" };
         let options = mcap::WriteOptions::new().profile(profile).compression_threads(0);
@@ -75,6 +77,7 @@ impl ViewerFile {
             chunk_ns: 0,
             channels: HashMap::new(),
             rasters: BTreeMap::new(),
+            frames: frames_of(recording),
             placed: HashMap::new(),
             with_poses: HashSet::new(),
             decoder: None,
@@ -117,13 +120,12 @@ impl ViewerFile {
                 }
             }
             Dialect::Ros2 => {
-                let grid = ros::occupancy_grid(map, layer, raster);
-                let topic = format!("/clearway/{vehicle}/{name}");
-                self.write_ros(&topic, &OCCUPANCY_GRID, &grid, log_ns)?;
-                if name == safe_paths::LAYER {
-                    let (markers, poses) = (ros::safe_path_markers(map, layer), ros::safe_point_poses(map, layer));
-                    self.write_ros(&format!("{topic}/markers"), &MARKER_ARRAY, &markers, log_ns)?;
-                    self.write_ros(&format!("{topic}/poses"), &POSE_ARRAY, &poses, log_ns)?;
+                let frames = self.frames_of(vehicle);
+                let shown = ShownLayer { map, layer, raster, frames: &frames, is_fresh: true };
+                for topic in ros::topics_of(name) {
+                    let Some(message) = (topic.write)(&shown) else { continue };
+                    let name = format!("/clearway/{vehicle}/{name}{}", topic.ending);
+                    self.write_ros((&name, topic.is_latched), &topic.kind, &message, log_ns)?;
                 }
             }
         }
@@ -150,12 +152,8 @@ impl ViewerFile {
                 None => Ok(()),
             },
             Dialect::Ros2 => {
-                let (Some(tf), Some(odometry)) = (ros::tf(map), ros::odometry(map)) else { return Ok(()) };
-                if self.with_poses.contains(map.vehicle()) {
-                    Ok(())
-                } else {
-                    self.write_odometry(map.vehicle(), &tf, &odometry, log_ns)
-                }
+                let pose = ros::pose_of(map).filter(|_| !self.with_poses.contains(map.vehicle()));
+                pose.map_or(Ok(()), |pose| self.write_odometry(map.vehicle(), &pose, log_ns))
             }
         }
     }
@@ -167,30 +165,37 @@ impl ViewerFile {
         let Some(map_from_ego) = pose.map_from_ego.as_ref().map(isometry) else { return Ok(()) };
         let pose = EgoPose { stamp_ns: pose.stamp_ns, map_from_ego, speed_mps: pose.speed_mps };
         self.with_poses.insert(vehicle.to_owned());
-        self.write_odometry(vehicle, &ros::tf_of(vehicle, &pose), &ros::odometry_of(vehicle, &pose), message.log_ns)
+        self.write_odometry(vehicle, &pose, message.log_ns)
     }
 
-    fn write_odometry(&mut self, vehicle: &str, tf: &[u8], odometry: &[u8], log_ns: u64) -> Result<()> {
-        self.write_ros("/tf", &TF_MESSAGE, tf, log_ns)?;
-        self.write_ros(&format!("/clearway/{vehicle}/odometry"), &ODOMETRY, odometry, log_ns)
+    fn write_odometry(&mut self, vehicle: &str, pose: &EgoPose, log_ns: u64) -> Result<()> {
+        let frames = self.frames_of(vehicle);
+        self.write_ros(("/tf", false), &TF_MESSAGE, &ros::tf_of(&frames, pose), log_ns)?;
+        let (topic, odometry) = (format!("/clearway/{vehicle}/odometry"), ros::odometry_of(&frames, pose));
+        self.write_ros((&topic, false), &ODOMETRY, &odometry, log_ns)
+    }
+
+    fn frames_of(&self, vehicle: &str) -> FrameNames {
+        self.frames.get(vehicle).cloned().unwrap_or_else(|| FrameNames::new(vehicle, None))
     }
 
     fn write_scan(&mut self, vehicle: &str, scan: &DecodedScan, log_ns: u64) -> Result<()> {
         let frame = format!("{vehicle}/{}", scan.sensor);
-        let (stamp_ns, base, mount) = (scan.stamp_ns, base_frame(vehicle), scan.ego_from_sensor);
+        let (stamp_ns, mount) = (scan.stamp_ns, scan.ego_from_sensor);
         match self.dialect {
             Dialect::Foxglove => {
-                let mount = messages::transform(stamp_ns, &base, &frame, mount);
+                let mount = messages::transform(stamp_ns, &base_frame(vehicle), &frame, mount);
                 self.write_foxglove("/tf", &FrameTransforms { transforms: vec![mount] }, log_ns)?;
                 let cloud = messages::points(stamp_ns, &frame, scan.points.at.iter().copied());
                 self.write_foxglove(&format!("/{vehicle}/points/{}", scan.sensor), &cloud, log_ns)
             }
             Dialect::Ros2 => {
-                self.write_ros("/tf", &TF_MESSAGE, &ros::transform(stamp_ns, &base, &frame, mount), log_ns)?;
+                let mount = ros::transform(stamp_ns, &self.frames_of(vehicle).ego, &frame, mount);
+                self.write_ros(("/tf", false), &TF_MESSAGE, &mount, log_ns)?;
                 let ScanPoints { at, ring, offset_ns } = &scan.points;
                 let cloud = ros::points(stamp_ns, &frame, at, ring, offset_ns);
                 let topic = format!("/clearway/{vehicle}/points/{}", scan.sensor);
-                self.write_ros(&topic, &POINT_CLOUD2, &cloud, log_ns)
+                self.write_ros((&topic, false), &POINT_CLOUD2, &cloud, log_ns)
             }
         }
     }
@@ -200,16 +205,24 @@ impl ViewerFile {
         message.encode(&mut bytes).map_err(|error| anyhow::anyhow!("encode for {topic}: {error}"))?;
         let schema = T::get_schema().context("a Foxglove message has a schema")?;
         let schema = (schema.name.as_str(), schema.encoding.as_str(), &*schema.data);
-        self.write(topic, schema, &T::get_message_encoding(), log_ns, &bytes)
+        self.write((topic, BTreeMap::new()), schema, &T::get_message_encoding(), log_ns, &bytes)
     }
 
-    fn write_ros(&mut self, topic: &str, kind: &Published, message: &[u8], log_ns: u64) -> Result<()> {
-        self.write(topic, (&kind.name(), "ros2msg", kind.definition.as_bytes()), "cdr", log_ns, message)
+    /// Writes a message of a topic, which is latched or not.
+    fn write_ros(
+        &mut self,
+        (topic, is_latched): (&str, bool),
+        kind: &Published,
+        message: &[u8],
+        log_ns: u64,
+    ) -> Result<()> {
+        let metadata = ros_metadata(is_latched);
+        self.write((topic, metadata), (&kind.name(), "ros2msg", kind.definition.as_bytes()), "cdr", log_ns, message)
     }
 
     fn write(
         &mut self,
-        topic: &str,
+        (topic, metadata): (&str, BTreeMap<String, String>),
         (schema, schema_encoding, definition): (&str, &str, &[u8]),
         encoding: &str,
         log_time: u64,
@@ -222,7 +235,6 @@ impl ViewerFile {
             }
             None => {
                 let schema = self.writer.add_schema(schema, schema_encoding, definition)?;
-                let metadata = if self.dialect == Dialect::Ros2 { ros_metadata(topic) } else { BTreeMap::new() };
                 let channel = self.writer.add_channel(schema, topic, encoding, &metadata)?;
                 self.channels.insert(topic.to_owned(), (channel, 0));
                 (channel, 0)
@@ -238,11 +250,25 @@ impl ViewerFile {
     }
 }
 
+/// The part of the recorded configuration that names frames.
+#[derive(Deserialize)]
+struct RecordedFrames {
+    name: String,
+    ros: Option<Ros>,
+}
+
+/// The frames of the vehicles in a recording's configuration, by vehicle.
+fn frames_of(recording: &Header) -> BTreeMap<String, FrameNames> {
+    let table = recording.config.as_deref().and_then(|text| text.parse::<toml::Table>().ok()).unwrap_or_default();
+    let vehicles = table.get("vehicle").cloned().and_then(|vehicles| vehicles.try_into::<Vec<RecordedFrames>>().ok());
+    let named = |RecordedFrames { name, ros }| (FrameNames::new(&name, ros.as_ref()), name);
+    vehicles.into_iter().flatten().map(named).map(|(frames, name)| (name, frames)).collect()
+}
+
 /// What rosbag2 offers a topic with when it plays the file, as the live topics are offered: reliable, and of maps the
 /// newest one for subscribers that come later. The numbers come from `rmw/types.h`, which each version reads.
-fn ros_metadata(topic: &str) -> BTreeMap<String, String> {
-    let is_moving = topic == "/tf" || topic.contains("/points/") || topic.ends_with("/odometry");
-    let (depth, durability) = if is_moving { (100, 2) } else { (1, 1) };
+fn ros_metadata(is_latched: bool) -> BTreeMap<String, String> {
+    let (depth, durability) = if is_latched { (1, 1) } else { (100, 2) };
     let unlimited = "{sec: 0, nsec: 0}";
     let profile = format!(
         "- {{history: 1, depth: {depth}, reliability: 1, durability: {durability}, deadline: {unlimited}, lifespan: \

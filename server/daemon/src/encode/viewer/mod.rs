@@ -1,16 +1,21 @@
 //! Maps for ROS 2 and Foxglove: messages of one [`MapView`].
 //!
-//! Frames: grids and points in `<vehicle>/base_link`, the ego frame; if poses are known, that frame in `map`. Every
-//! stamp is the end of the capture.
+//! Frames: Foxglove's grids and points lie in `<vehicle>/base_link`, the ego frame; if poses are known, that frame in
+//! `map`. ROS 2 has the frames of the vehicle's input ([`FrameNames`]); its grids lie in the fixed frame if a pose is
+//! known. Every stamp is the end of the capture.
 //!
 //! | file | in -> out |
 //! |---|---|
 //! | [`raster`] | a layer -> square cells, as occupancies or colours |
+//! | [`aligned`] | square cells and their pose -> cells along the axes of a frame |
+//! | [`clouds`] | a layer of squares -> points that mark and clear |
 //! | [`safe_paths`] | safe points -> lines, circles, poses |
 //! | [`frame`] | a map -> its frames and its pose |
 //! | [`ros`] | a map -> CDR messages of ROS 2 |
 //! | [`foxglove`] | a map -> Foxglove's messages |
 
+pub mod aligned;
+pub mod clouds;
 pub mod foxglove;
 pub mod frame;
 pub mod raster;
@@ -21,7 +26,7 @@ use bytes::Bytes;
 use clearway_client::MapView;
 use clearway_journal::encode::EncodedMap;
 
-pub use frame::base_frame;
+pub use frame::{FrameNames, base_frame};
 pub use raster::Raster;
 
 /// The decoded `bytes` of `map`; `None`, and an error in the log, if they cannot be decoded.

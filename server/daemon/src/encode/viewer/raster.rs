@@ -12,7 +12,7 @@
 //! | 100 | occupied, low, not reached |
 //! | -1 | unknown, inferred, hidden |
 //!
-//! There is no value between, because planners with a threshold would treat less than 100 as free.
+//! There is no value between, because planners with a threshold treat less than 100 as free.
 
 use std::collections::BTreeMap;
 
@@ -33,8 +33,10 @@ const NOWHERE: u32 = u32::MAX;
 
 /// Occupancy of an unknown cell.
 pub const UNKNOWN: i8 = -1;
-const FREE: i8 = 0;
-const OCCUPIED: i8 = 100;
+/// Occupancy of a free cell.
+pub const FREE: i8 = 0;
+/// Occupancy of a cell that a planner must not enter.
+pub const OCCUPIED: i8 = 100;
 
 /// The square cells of a grid, and the cells of the grid that they show.
 #[derive(Clone, Debug, PartialEq)]
@@ -102,6 +104,11 @@ impl Raster {
         }
     }
 
+    /// Number of its cells.
+    pub fn cells(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
     /// The occupancy of each cell of a layer with this grid.
     pub fn occupancies(&self, layer: &Layer) -> Vec<i8> {
         let occupancies = occupancies(layer);
@@ -132,15 +139,7 @@ impl Raster {
 impl Samples {
     /// The radial cell that each square cell shows.
     fn worst(&self, occupancies: &[i8]) -> impl Iterator<Item = u32> + use<> {
-        // Unknown is worse than free, and better than an obstacle.
-        let rank = |cell: u32| match cell {
-            NOWHERE => 0,
-            cell => match at(occupancies, cell) {
-                FREE => 1,
-                UNKNOWN => 2,
-                occupied => 2 + i16::from(occupied),
-            },
-        };
+        let rank = |cell: u32| (cell != NOWHERE).then(|| rank(at(occupancies, cell)));
         let mut shown = self.at_middle.clone();
         for &(square, cell) in &self.inside {
             let shown = &mut shown[square as usize];
@@ -152,16 +151,26 @@ impl Samples {
     }
 }
 
+/// Order from the best to the worst occupancy: unknown is worse than free, and better than an obstacle.
+pub(super) fn rank(occupancy: i8) -> i8 {
+    if occupancy == UNKNOWN { OCCUPIED - 1 } else { occupancy }
+}
+
 fn at(occupancies: &[i8], cell: u32) -> i8 {
     occupancies.get(cell as usize).copied().unwrap_or(UNKNOWN)
 }
 
-/// The occupancy of each of the layer's own cells; unknown if it has no classes.
+/// The occupancy of each of the layer's own cells.
 fn occupancies(layer: &Layer) -> Vec<i8> {
-    let of_class: Vec<i8> = layer.legend.iter().map(|class| occupancy(class.meaning)).collect();
-    let of = |class: i32| usize::try_from(class).ok().and_then(|class| of_class.get(class).copied()).unwrap_or(UNKNOWN);
+    meanings(layer).into_iter().map(occupancy).collect()
+}
+
+/// The meaning of each of the layer's own cells; unknown if it has no classes.
+pub(super) fn meanings(layer: &Layer) -> Vec<ClassMeaning> {
+    let class = |class: i32| layer.legend.get(usize::try_from(class).ok()?);
+    let of = |number: i32| class(number).map_or(ClassMeaning::Unknown, |class| class.meaning);
     match layer.channel("class").map(|channel| &channel.cells) {
-        None => vec![UNKNOWN; layer.grid.cell_count() as usize],
+        None => vec![ClassMeaning::Unknown; layer.grid.cell_count() as usize],
         Some(Cells::U8(cells)) => cells.iter().map(|&class| of(class.into())).collect(),
         Some(Cells::I8(cells)) => cells.iter().map(|&class| of(class.into())).collect(),
         Some(Cells::U16(cells)) => cells.iter().map(|&class| of(class.into())).collect(),

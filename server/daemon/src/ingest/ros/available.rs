@@ -50,6 +50,8 @@ pub(super) struct Topic {
     pub kind: Kind,
     /// Frame of a sensor's points, or child frame of an odometry; of the first readable message.
     pub frame_id: Option<String>,
+    /// Frame of the poses; of the first readable message.
+    pub fixed_frame: Option<String>,
     /// Stamps of the first messages.
     pub stamps: Stamps,
     /// Most points of a message.
@@ -88,7 +90,8 @@ impl AvailableTopics {
 
     fn insert(&mut self, topic: String, kind: Kind, bytes: &[u8]) {
         let (order, are_static) = (self.topics.len(), topic.ends_with("tf_static"));
-        let new = Topic { kind, frame_id: None, stamps: Stamps::default(), points: 0, order, refused: None };
+        let (frame_id, fixed_frame, stamps) = Default::default();
+        let new = Topic { kind, frame_id, fixed_frame, stamps, points: 0, order, refused: None };
         let found = self.topics.entry(topic).or_insert_with(|| new.clone());
         // The messages of the other type are refused.
         if kind.is_sensor() && !found.kind.is_sensor() {
@@ -112,8 +115,12 @@ impl AvailableTopics {
             Kind::Odometry => Odometry::new(bytes).map(|Odometry { transform, .. }| {
                 found.stamps.note(transform.header.stamp_ns);
                 found.frame_id.get_or_insert_with(|| name(transform.child_frame_id).to_owned());
+                found.fixed_frame.get_or_insert_with(|| name(transform.header.frame_id).to_owned());
             }),
-            Kind::PoseStamped => pose_stamped(bytes).map(|pose| found.stamps.note(pose.header.stamp_ns)),
+            Kind::PoseStamped => pose_stamped(bytes).map(|pose| {
+                found.stamps.note(pose.header.stamp_ns);
+                found.fixed_frame.get_or_insert_with(|| name(pose.header.frame_id).to_owned());
+            }),
         };
         if let Err(fault) = read {
             found.refused.get_or_insert_with(|| (0, fault.to_string())).0 += 1;

@@ -66,6 +66,8 @@ pub struct TopicChoice {
     pub pose: Option<PoseSource>,
     /// The vehicle's frame.
     pub ego_frame: String,
+    /// The frame of the poses; empty if there are none, or if they name none.
+    pub fixed_frame: String,
     /// A description of the choice, for people.
     pub notes: Vec<String>,
     latched: Frames,
@@ -110,7 +112,13 @@ impl AvailableTopics {
             sensors.sort_by_key(|sensor| std::cmp::Reverse(shown(sensor)));
         }
         let notes = self.describe(&sensors, pose.as_ref(), &ego_frame);
-        Ok(TopicChoice { sensors, pose, ego_frame, notes, latched: self.latched.clone() })
+        let fixed_frame = match &pose {
+            Some(PoseSource::Topic(topic)) => self.topics[topic].fixed_frame.clone(),
+            Some(PoseSource::Frames { fixed }) => Some(fixed.clone()),
+            None => None,
+        };
+        let fixed_frame = fixed_frame.unwrap_or_default();
+        Ok(TopicChoice { sensors, pose, ego_frame, fixed_frame, notes, latched: self.latched.clone() })
     }
 
     /// The vehicle's frame: of those in the tf tree the one to which the frame of a sensor is joined; without tf the
@@ -337,6 +345,7 @@ impl TopicChoice {
         let still = self.sensors.iter().filter(|sensor| sensor.still_ns.is_some()).map(|sensor| sensor.topic.clone());
         let frames = self.sensors.iter().map(|sensor| (sensor.topic.clone(), sensor.frame_id.clone()));
         TopicDecoder::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone())
+            .posed_in(&self.fixed_frame)
             .lowering(merged.collect())
             .stamping(still.collect())
             .expecting(frames.collect())

@@ -58,6 +58,14 @@ pub enum RosMessageError {
         /// The frame of the message.
         found: String,
     },
+    /// A pose is in another frame than the vehicle's poses.
+    #[error("a pose in frame {found}: allowed: {fixed_frame}, the fixed frame of the vehicle")]
+    OtherFixedFrame {
+        /// The vehicle's fixed frame.
+        fixed_frame: String,
+        /// The frame of the message.
+        found: String,
+    },
     /// No chain of transforms joins the message's frame and the vehicle's.
     #[error("frame {frame}: no chain of transforms joins it to {ego_frame}")]
     Frame {
@@ -74,7 +82,7 @@ impl RosMessageError {
         match self {
             Self::Message(_) => "ros_message",
             Self::Kind { .. } => "ros_kind",
-            Self::OtherFrame { .. } | Self::Frame { .. } => "ros_frame",
+            Self::OtherFrame { .. } | Self::OtherFixedFrame { .. } | Self::Frame { .. } => "ros_frame",
         }
     }
 }
@@ -86,6 +94,8 @@ pub struct TopicDecoder {
     sensors: BTreeMap<String, u16>,
     pose: Option<PoseSource>,
     ego_frame: String,
+    /// The frame of the poses; empty: any.
+    fixed_frame: String,
     frames: Frames,
     /// Stamp and `map_from_ego` of the newest pose without a speed.
     newest: Option<(i64, Isometry3<f64>)>,
@@ -102,9 +112,20 @@ pub struct TopicDecoder {
 impl TopicDecoder {
     /// A decoder of these topics; `frames` are the transforms that are known before the first message.
     pub fn new(sensors: BTreeMap<String, u16>, pose: Option<PoseSource>, ego_frame: &str, frames: Frames) -> Self {
-        let (lowered, still, cloud_frames) = Default::default();
+        let (lowered, still, cloud_frames, fixed_frame) = Default::default();
         let (ego_frame, steps_to_moving) = (ego_frame.to_owned(), usize::MAX);
-        Self { sensors, pose, ego_frame, frames, newest: None, steps_to_moving, lowered, still, cloud_frames }
+        Self {
+            sensors,
+            pose,
+            ego_frame,
+            fixed_frame,
+            frames,
+            newest: None,
+            steps_to_moving,
+            lowered,
+            still,
+            cloud_frames,
+        }
     }
 
     /// The decoder, with the points of these topics, which are in the vehicle's frame, moved to the frame of a sensor
@@ -121,6 +142,12 @@ impl TopicDecoder {
     /// The decoder, which refuses clouds in other frames than these, by topic: they are of another sensor.
     pub(super) fn expecting(self, cloud_frames: BTreeMap<String, String>) -> Self {
         Self { cloud_frames, ..self }
+    }
+
+    /// The decoder, which refuses poses of the topic of poses in another frame than this one; empty: any frame. Grids
+    /// are published in this frame, and poses of two frames would jump.
+    pub(super) fn posed_in(self, fixed_frame: &str) -> Self {
+        Self { fixed_frame: fixed_frame.to_owned(), ..self }
     }
 
     /// True if messages of this topic and type are decoded.
@@ -198,6 +225,7 @@ impl TopicDecoder {
                 Kind::Odometry => self.pose_of_odometry(&Odometry::new(bytes)?)?,
                 Kind::PoseStamped => {
                     let pose = pose_stamped(bytes)?;
+                    self.check_fixed_frame(pose.header.frame_id)?;
                     self.pose_with_speed(pose.header.stamp_ns, pose.parent_from_child)
                 }
                 kind => return Err(RosMessageError::Kind { kind, allowed: "Odometry and PoseStamped for poses" }),
@@ -207,9 +235,18 @@ impl TopicDecoder {
         Ok(refused)
     }
 
+    fn check_fixed_frame(&self, frame_id: &str) -> Result<(), RosMessageError> {
+        if self.fixed_frame.is_empty() || name(frame_id) == self.fixed_frame {
+            return Ok(());
+        }
+        let (fixed_frame, found) = (self.fixed_frame.clone(), frame_id.to_owned());
+        Err(RosMessageError::OtherFixedFrame { fixed_frame, found })
+    }
+
     /// An odometry without a child frame is that of the vehicle.
     fn pose_of_odometry(&mut self, odometry: &Odometry) -> Result<Option<EgoPose>, RosMessageError> {
         let StampedTransform { header, child_frame_id, parent_from_child } = &odometry.transform;
+        self.check_fixed_frame(header.frame_id)?;
         let child_frame_id = if child_frame_id.is_empty() { &self.ego_frame } else { *child_frame_id };
         let child_from_ego = self.frames.a_from_b(child_frame_id, &self.ego_frame).ok_or_else(|| {
             RosMessageError::Frame { frame: child_frame_id.to_owned(), ego_frame: self.ego_frame.clone() }

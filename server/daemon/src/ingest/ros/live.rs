@@ -80,7 +80,7 @@ pub async fn subscribe<'a>(
     };
     let pose_topic = (!ros.pose.is_empty()).then(|| ros.pose.clone());
     let topics: Vec<String> = sensors.keys().cloned().chain(pose_topic).chain([ros.tf.clone()]).collect();
-    let decoder = TopicDecoder::new(sensors, pose, &ros.ego_frame, Frames::default());
+    let decoder = TopicDecoder::new(sensors, pose, &ros.ego_frame, Frames::default()).posed_in(&ros.fixed_frame);
     let receiver =
         Arc::new(Mutex::new(SampleReceiver { vehicle: vehicle.into(), decoder, queue, sequences: BTreeMap::new() }));
     let mut subscribed = LiveTopics { vehicle: vehicle.into(), topics: Vec::new(), latched: Vec::new() };
