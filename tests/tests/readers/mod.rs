@@ -2,6 +2,7 @@
 
 mod bad;
 mod browsers;
+mod nav2;
 mod python;
 mod streams;
 mod viewers;
