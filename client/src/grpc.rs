@@ -6,13 +6,11 @@
 
 use std::time::Duration;
 
-use bytes::Bytes;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;
 use clearway_proto::{SERVED_AT, v1};
-use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt};
@@ -22,8 +20,10 @@ use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity
 use crate::error::ClientError;
 use crate::freshness::Clock;
 use crate::ingest::{Ingester, ReportReceiver, SendObservation};
-use crate::stream::{LatestSlot, MapStream, Missed};
+use crate::stream::MapStream;
 use crate::view::MapView;
+
+mod follow;
 
 /// Flow-control window of a stream, in bytes: one map with the default grids. More would queue old maps.
 const WINDOW_BYTES: u32 = 65_535;
@@ -62,6 +62,10 @@ pub struct Subscription {
     /// True: a map is as old as it was when it was made, plus the time since it came. So the maps of a replay that
     /// keeps the recorded stamps are judged by the replay's clock; pass [`MapView::now_ns`] to [`MapView::is_stale`].
     pub replay_clock: bool,
+    /// True: a stream that a server or a connection has ended is opened again, after pauses of 0.1 to 5 s;
+    /// [`MapStream::reasons`] and the log say so. It ends if the server refuses the subscription itself, such as after
+    /// the loss of a role.
+    pub reconnects: bool,
 }
 
 /// Certificates of an encrypted connection, as PEM text. Debug output does not show them.
@@ -85,6 +89,7 @@ impl Default for Subscription {
             region: None,
             deltas: false,
             replay_clock: false,
+            reconnects: false,
         }
     }
 }
@@ -215,17 +220,18 @@ impl Client {
     /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the vehicle, a layer, the rate
     /// or the region cannot be served.
     pub async fn subscribe(&self, subscription: Subscription) -> Result<MapStream, ClientError> {
-        let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, replay_clock } = subscription;
+        let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, .. } = subscription;
+        let Subscription { replay_clock, reconnects, .. } = subscription;
         let max_in_flight = max_in_flight.max(1);
-        let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas };
-        let (mut address, mut opened) = (self.address.clone(), self.watch(&selection).await?);
+        let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, states: true };
+        let (mut client, mut opened) = (self.clone(), self.watch(&selection).await?);
         if let Some(server) = self.led_by(opened.as_ref().err()).await? {
             opened = server.watch(&selection).await?;
-            address = server.address;
+            client = server;
         }
-        let (updates, acknowledge) = opened.map_err(|status| refused(&address, &status))?;
+        let opened = opened.map_err(|status| refused(&client.address, &status))?;
         let clock = Clock { is_of_replay: replay_clock, ..Clock::default() };
-        Ok(MapStream::spawn(clock, move |slot| receive_maps(slot, address, updates, acknowledge)))
+        Ok(MapStream::spawn(clock, move |slot| follow::follow(slot, client, selection, opened, reconnects)))
     }
 
     /// Opens a stream of maps on a connection of its own. The inner error is the server's answer.
@@ -301,64 +307,6 @@ impl Tls {
         }
         config
     }
-}
-
-/// Stores the map of every update in the slot and acknowledges it, in lockstep when it was handled; returns why the
-/// stream ended. If a delta needs a map
-/// that is not here (an update was lost), it requests a keyframe. Maps not stored count as skipped, except those that
-/// the requested rate excluded.
-async fn receive_maps(
-    slot: LatestSlot,
-    address: String,
-    mut updates: tonic::Streaming<v1::MapUpdate>,
-    requests: mpsc::Sender<v1::WatchRequest>,
-) -> ClientError {
-    let mut base: Option<MapView> = None;
-    let (mut is_requested, mut left_out) = (false, 0);
-    loop {
-        let update = match updates.message().await {
-            Ok(Some(update)) => update,
-            Ok(None) => return ClientError::Ended { address },
-            Err(status) => return refused(&address, &status),
-        };
-        if update.replay_ended {
-            slot.end_replay(ClientError::ReplayEnded { address: address.clone() });
-            continue;
-        }
-        left_out += update.left_out;
-        let request = match MapView::decode_on(update.map.clone(), base.as_ref()) {
-            Ok(map) => {
-                let sequence = map.sequence();
-                // Maps of another run, or before a jump of a replay, were not skipped.
-                let last = base.replace(map.clone()).filter(|last| last.header().boot_id == map.header().boot_id);
-                let last = last.map_or(sequence, |last| last.sequence() + 1);
-                let skipped = sequence.saturating_sub(last).saturating_sub(left_out);
-                slot.store(map, |_| Missed { skipped, left_out, ..Missed::default() });
-                (is_requested, left_out) = (false, 0);
-                v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() }
-            }
-            Err(error) => {
-                let Some(acknowledged) = sequence_of_delta(update.map) else { return error };
-                tracing::debug!(sequence = acknowledged, %error, "a keyframe is requested: a base is missing");
-                // More deltas may be in flight; one request is enough for all of them.
-                let request_keyframe = !std::mem::replace(&mut is_requested, true);
-                v1::WatchRequest { acknowledged: Some(acknowledged), request_keyframe, selection: None }
-            }
-        };
-        if update.lockstep && request.acknowledged.is_some() && !request.request_keyframe {
-            slot.handled().await;
-        }
-        if requests.send(request).await.is_err() {
-            return ClientError::Ended { address };
-        }
-    }
-}
-
-/// Sequence number of a map with a delta; `None` if all layers are whole, or the bytes are not a map.
-fn sequence_of_delta(bytes: Bytes) -> Option<u64> {
-    let map = v1::Map::decode(bytes).ok()?;
-    let is_delta = map.layers.iter().any(|layer| layer.base_sequence.is_some());
-    map.header.filter(|_| is_delta).map(|header| header.sequence)
 }
 
 /// An address with the number of its IPv6 zone in place of the name, such as `[fe80::1%2]:50051`: URLs have no names.

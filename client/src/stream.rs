@@ -60,6 +60,7 @@ struct Slot {
     newest: Option<MapView>,
     counters: Counters,
     passed_over: PassedOver,
+    reasons: Vec<String>,
     ended: Option<ClientError>,
     /// How often a replay has reached its end, and how the reader is told.
     replay_ends: u64,
@@ -233,6 +234,12 @@ impl MapStream {
         self.slot.borrow().passed_over
     }
 
+    /// Why no map comes, worst first: the reasons of the vehicle's state on the server, or why there is no connection
+    /// ([`crate::Subscription::reconnects`]). Empty while maps come, in the first second without one, and over zenoh.
+    pub fn reasons(&self) -> Vec<String> {
+        self.slot.borrow().reasons.clone()
+    }
+
     /// Why the stream has ended; `None` if it has not.
     pub fn ended(&self) -> Option<ClientError> {
         self.slot.borrow().ended.clone()
@@ -305,7 +312,16 @@ impl LatestSlot {
             counters.left_out = counters.left_out.saturating_add(missed.left_out);
             slot.newest = Some(map);
             slot.is_at_end = false;
+            slot.reasons.clear();
             true
+        });
+    }
+
+    /// Sets why no map comes, until one is stored. No reader that waits for a map is notified.
+    pub(crate) fn set_reasons(&self, reasons: Vec<String>) {
+        self.slot.send_if_modified(|slot| {
+            slot.reasons = reasons;
+            false
         });
     }
 

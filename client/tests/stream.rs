@@ -87,7 +87,7 @@ async fn every_map_is_acknowledged_and_skipped_maps_are_counted() {
     let layers = vec!["drivability".to_string()];
     let mut maps = client.subscribe(Subscription { layers: layers.clone(), ..Default::default() }).await.unwrap();
     let selection = received.recv().await.unwrap().selection.unwrap();
-    assert_eq!(selection, v1::Selection { vehicle: String::new(), layers, max_in_flight: 2, ..Default::default() });
+    assert_eq!(selection, v1::Selection { layers, max_in_flight: 2, states: true, ..Default::default() });
     for sequence in [0, 3, 4] {
         assert_eq!(received.recv().await.unwrap().acknowledged, Some(sequence));
     }

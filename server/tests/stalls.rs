@@ -1,5 +1,6 @@
 //! A server that stands still, that hangs, that has no data and that is gone, as planners and people see it.
 
+use std::io::{BufRead, BufReader};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
@@ -224,6 +225,47 @@ async fn an_engine_that_hangs_is_in_the_status_and_does_not_keep_the_server_from
         }
     })
     .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn watch_waits_for_a_server_that_is_not_there_and_again_when_it_has_ended() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut server = Server::start(folder.path(), [127, 0, 0, 84]);
+    drop(within("a connection", server.subscribe()).await);
+    let mut watch = Command::new(env!("CARGO_BIN_EXE_clearway"));
+    watch.args(["watch", "--server", &server.grpc.to_string()]);
+    let mut watching = watch.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(watching.stdout.take().unwrap()).lines();
+    let mut says = |part: &str| {
+        let line = lines.by_ref().take(120).map(Result::unwrap).find(|line| line.contains(part));
+        assert!(line.is_some(), "watch ended before a line with {part:?}");
+    };
+    says("STALE: waiting for the first map: no packets from top since the server started");
+    server.process.kill().unwrap();
+    server.process.wait().unwrap();
+    says(&server.grpc.to_string());
+    let restart = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_clearway"));
+        command.args(["serve", "--config"]).arg(folder.path().join("clearway.toml")).stderr(Stdio::null()).spawn()
+    };
+    server.process = restart().unwrap();
+    let vehicle = Vehicle::driving_to(server.data, Pace::RealTime);
+    says("car #");
+    watching.kill().unwrap();
+    watching.wait().unwrap();
+    // At the start too.
+    server.process.kill().unwrap();
+    server.process.wait().unwrap();
+    let mut watching = watch.spawn().unwrap();
+    let mut said = BufReader::new(watching.stderr.take().unwrap()).lines();
+    let waits = said.next().unwrap().unwrap();
+    assert!(waits.contains("no clearway server answers") && waits.ends_with("waiting for it"), "{waits}");
+    server.process = restart().unwrap();
+    let first = BufReader::new(watching.stdout.take().unwrap()).lines().next().unwrap().unwrap();
+    assert!(first.starts_with("car #") || first.starts_with("STALE"), "{first}");
+    watching.kill().unwrap();
+    watching.wait().unwrap();
+    drop(vehicle);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

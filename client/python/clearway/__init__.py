@@ -42,6 +42,7 @@ def watch(
     tls: Tls | None = None,
     signed_by: str | PathLike[str] | None = None,
     replay_clock: bool = False,
+    reconnect: bool = False,
 ) -> MapStream:
     """Streams the newest map, starting with the present one.
 
@@ -50,9 +51,10 @@ def watch(
     arguments are for gRPC: at most `max_in_flight` maps are sent without an acknowledgement, and at most `max_rate_hz`
     maps per second. Each layer is cut to the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With
     `deltas`, layers are sent as changes from the map before: fewer bytes, the same maps. With `replay_clock`, a map is
-    as old as it was when it was made, plus the time since it came: for a replay that keeps the recorded stamps. Errors
-    of the server are raised by the first `next`; for an unknown vehicle or layer the message lists the known ones. For
-    zenoh: with `signed_by`, the PEM file of a server's public key, only maps that this server has signed are believed;
+    as old as it was when it was made, plus the time since it came: for a replay that keeps the recorded stamps. With
+    `reconnect`, the stream waits for a server that is not there, at the start and later, with pauses of 0.1 to 5 s;
+    `MapStream.reasons` and the log "clearway" say so. Errors of the server are raised by the first `next`; for an
+    unknown vehicle or layer the message lists the known ones. For zenoh, which always reconnects: with `signed_by`, the PEM file of a server's public key, only maps that this server has signed are believed;
     `MapStream.passed_over` counts the others.
     """
     _check_signed_by(address, signed_by)
@@ -68,7 +70,7 @@ def watch(
     if region is not None:
         x_from_m, x_to_m, y_from_m, y_to_m = region
         selection.region.CopyFrom(map_pb2.Region(x_from_m=x_from_m, x_to_m=x_to_m, y_from_m=y_from_m, y_to_m=y_to_m))
-    return over_grpc.watch(address, selection, tls, replay_clock=replay_clock)
+    return over_grpc.watch(address, selection, tls, replay_clock=replay_clock, reconnect=reconnect)
 
 
 def get(

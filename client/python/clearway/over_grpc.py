@@ -3,8 +3,10 @@ stalled reader delays no other reader and receives no old maps."""
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import grpc
@@ -27,10 +29,17 @@ _OPTIONS = [
     ("grpc.use_local_subchannel_pool", 1),
     # A vehicle is reached directly: a proxy of the environment is for the web.
     ("grpc.enable_http_proxy", 0),
-    # Longest time to connect.
+    # Longest time to connect; pauses between two attempts of a stream that is opened again.
     ("grpc.min_reconnect_backoff_ms", 5000),
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.max_reconnect_backoff_ms", 5000),
 ]
 _TIMEOUT_S = 5.0
+#: Shortest and longest pause before a stream is opened again, and the reasons for which it is not: another attempt
+#: would end in the same way.
+_PAUSE_S = (0.1, 5.0)
+_LASTING = {"INVALID_ARGUMENT", "PERMISSION_DENIED", "UNAUTHENTICATED", "FAILED_PRECONDITION", "UNIMPLEMENTED"}
+_log = logging.getLogger("clearway")
 
 
 def channel(address: str, tls: Tls | None = None) -> grpc.Channel:
@@ -86,13 +95,15 @@ def _get(address: str, request: service_pb2.GetMapRequest, tls: Tls | None) -> M
 
 
 class _Watch:
-    """One open stream of maps, on a connection of its own."""
+    """One open stream of maps, on a connection of its own. It waits for a server if it `waits`, with the pauses of
+    gRPC between two attempts."""
 
-    def __init__(self, address: str, selection: service_pb2.Selection, tls: Tls | None) -> None:
-        self.channel = channel(address, tls)
+    def __init__(self, address: str, selection: service_pb2.Selection, tls: Tls | None, *, waits: bool) -> None:
+        self.address, self.channel = address, channel(address, tls)
         self.requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
         self.requests.put(service_pb2.WatchRequest(selection=selection))
-        self.updates = service_pb2_grpc.MapServiceStub(self.channel).Watch(iter(self.requests.get, None))
+        service = service_pb2_grpc.MapServiceStub(self.channel)
+        self.updates = service.Watch(iter(self.requests.get, None), wait_for_ready=waits)
 
     def close(self) -> None:
         self.requests.put(None)
@@ -101,31 +112,51 @@ class _Watch:
 
 
 def watch(
-    address: str, selection: service_pb2.Selection, tls: Tls | None, *, replay_clock: bool = False
+    address: str,
+    selection: service_pb2.Selection,
+    tls: Tls | None,
+    *,
+    replay_clock: bool = False,
+    reconnect: bool = False,
 ) -> MapStream:
+    selection.states = True
     slot = LatestSlot(Clock(is_of_replay=replay_clock), has_one_server=True)
-    opened = [_Watch(address, selection, tls)]
+    opened = [_Watch(address, selection, tls, waits=False)]
 
-    def run(at: str, *, may_be_led: bool) -> None:
-        of = opened[-1]
-        try:
-            _receive_maps(slot, of.updates, of.requests.put, acknowledges=selection.max_in_flight > 0)
-            slot.end(ClearwayError("ended", f"{at}: the server has ended the stream"))
-        except grpc.RpcError as error:
-            server = _led_to(error) if may_be_led else None
-            if server is None:
-                slot.end(refused(at, error))
+    def run() -> None:
+        is_led, pause_s = False, _PAUSE_S[0]
+        while True:
+            of, newest = opened[-1], slot.newest()
+            try:
+                _receive_maps(slot, of.updates, of.requests.put, acknowledges=selection.max_in_flight > 0)
+                ended = ClearwayError("ended", f"{of.address}: the server has ended the stream")
+            except grpc.RpcError as error:
+                ended, server = refused(of.address, error), None if is_led else _led_to(error)
+                if server is not None:
+                    is_led = True
+                    of.close()
+                    opened[-1] = _Watch(server, selection, tls, waits=False)
+                    continue
+            except ClearwayError as error:
+                slot.end(error)
                 return
+            except Exception as error:  # noqa: BLE001: any error ends the stream.
+                slot.end(ClearwayError("protobuf", f"{of.address}: {error}"))
+                return
+            if not reconnect or ended.reason in _LASTING or slot.closed:
+                slot.end(ended)
+                return
+            _log.warning("%s; the stream of maps is opened again", ended)
+            slot.set_reasons([str(ended)])
             of.close()
-            opened.append(_Watch(server, selection, tls))
-            run(server, may_be_led=False)
-        except ClearwayError as error:
-            slot.end(error)
-        except Exception as error:  # noqa: BLE001: any error ends the stream.
-            slot.end(ClearwayError("protobuf", f"{at}: {error}"))
+            pause_s = min(2 * pause_s, _PAUSE_S[1]) if slot.newest() is newest else _PAUSE_S[0]
+            time.sleep(pause_s)
+            opened[-1] = _Watch(of.address, selection, tls, waits=True)
+            if slot.closed:
+                opened[-1].close()
 
-    threading.Thread(target=run, args=(address,), kwargs={"may_be_led": True}, name="clearway watch", daemon=True).start()
-    return MapStream(slot, lambda: [of.close() for of in list(opened)])
+    threading.Thread(target=run, name="clearway watch", daemon=True).start()
+    return MapStream(slot, lambda: opened[-1].close())
 
 
 def _receive_maps(
@@ -138,11 +169,15 @@ def _receive_maps(
     """Stores the map of every update and acknowledges it, in lockstep when it was handled. If a delta needs a map that
     is not here (an update was lost), it requests a keyframe. Maps not stored count as skipped, except those that the
     requested rate excluded."""
-    base: Map | None = None
+    # That of the stream before, if this one is opened again.
+    base = slot.newest()
     is_requested, left_out = False, 0
     for update in updates:
         if update.replay_ended:
             slot.end_replay()
+            continue
+        if update.HasField("vehicle"):
+            slot.set_reasons(update.vehicle.reasons)
             continue
         left_out += update.left_out
         message = map_pb2.Map.FromString(update.map)

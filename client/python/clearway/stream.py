@@ -6,13 +6,14 @@ map. A waiting reader is notified when its map becomes stale, also if no further
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-from .errors import ClearwayError, ReplayEnded
+from .errors import ClearwayError, ReplayEnded, forked
 from .freshness import POLL_INTERVAL_S, Clock
 from .map import Map
 
@@ -57,10 +58,13 @@ class MapStream:
 
     def __init__(self, slot: LatestSlot, close: Callable[[], None]) -> None:
         self._slot = slot
+        process = os.getpid()
 
         def end() -> None:
-            slot.close()
-            close()
+            # A process that was forked from this one has no thread to end.
+            if os.getpid() == process:
+                slot.close()
+                close()
 
         #: Called once: when the stream is closed or dropped, or the process ends.
         self._close = weakref.finalize(self, end)
@@ -107,19 +111,27 @@ class MapStream:
         """Numbers of received maps that were passed over since the start of the stream, by reason."""
         return self._slot.passed_over()
 
+    @property
+    def reasons(self) -> list[str]:
+        """Why no map comes, worst first: the reasons of the vehicle's state on the server, or why there is no
+        connection (`reconnect` of `clearway.watch`). Empty while maps come, in the first second without one, and over
+        zenoh."""
+        return self._slot.reasons()
+
 
 class LatestSlot:
     """The slot between a background thread, which stores maps, and a `MapStream`, which reads the newest. A thread has
     no reference to the stream, so that a stream ends when its reader drops it."""
 
     def __init__(self, clock: Clock = Clock(), *, has_one_server: bool = False) -> None:
-        self._clock = clock
+        self._clock, self._process = clock, os.getpid()
         #: True if all maps come from one server that is known: another run is then a jump of its replay.
         self._has_one_server = has_one_server
         self._changed = threading.Condition()
         self._newest: Map | None = None
         self._counters = _Counters()
         self._passed_over = PassedOver()
+        self._reasons: list[str] = []
         #: `_counters` at the map before; `None` before the first.
         self._seen: _Counters | None = None
         #: `_seen` when the reader asked for the next map: it has handled all maps until then.
@@ -143,6 +155,21 @@ class LatestSlot:
         with self._changed:
             return self._passed_over
 
+    def reasons(self) -> list[str]:
+        """Why no map comes."""
+        with self._changed:
+            return list(self._reasons)
+
+    def set_reasons(self, reasons: Iterable[str]) -> None:
+        """Sets why no map comes, until one is stored. For the background thread."""
+        with self._changed:
+            self._reasons = list(reasons)
+
+    @property
+    def closed(self) -> bool:
+        """True if the stream was closed."""
+        return self._closed
+
     def close(self) -> None:
         """Ends every wait for a map."""
         with self._changed:
@@ -151,6 +178,8 @@ class LatestSlot:
 
     def next(self, *, report_stale: bool) -> Map:
         """Waits as `MapStream.next_or_stale` does, or as `MapStream.__next__`. For the reader."""
+        if os.getpid() != self._process:
+            raise forked("the stream")
         with self._changed:
             self._handled = self._seen
             self._changed.notify_all()
@@ -206,7 +235,7 @@ class LatestSlot:
                 lost = min(lost, skipped)
             before = self._counters
             self._counters = _Counters(before.maps + 1 + skipped, before.lost + lost, before.left_out + left_out)
-            self._newest, self._at_end = m, False
+            self._newest, self._at_end, self._reasons = m, False, []
             self._changed.notify_all()
             return True
 

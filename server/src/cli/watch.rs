@@ -5,14 +5,14 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{ClientError, MapStream, PassedOver, Staleness, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{ClientError, MapStream, Staleness, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
 #[cfg(feature = "zenoh")]
 use crate::cli::shared::files;
-use crate::cli::shared::output::{block_on, counted, print_line};
+use crate::cli::shared::output::{block_on, counted, print_line, with_causes};
 
 /// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
 const STALE_PERIOD: Duration = Duration::from_secs(1);
@@ -24,9 +24,10 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
-/// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
-/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream, or if a
-/// replay ends before a map or the maps of --count have come.
+/// If no map arrives, or no newer one before the last one becomes stale, a line says STALE and why once a second until
+/// maps arrive again. Over gRPC it waits for a server that is not there, at the start and later, unless --count or
+/// --until-stale says when it ends. The exit code is 4 if the last line says STALE, and 2 if the server refuses or ends
+/// the stream, or if a replay ends before a map or the maps of --count have come.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
@@ -73,7 +74,7 @@ pub fn run(options: &WatchArguments) -> Result<Exit> {
 }
 
 async fn watch(options: &WatchArguments) -> Result<Exit> {
-    let mut maps = subscribe(options).await?;
+    let mut maps = subscribe_when_there(options).await?;
     let mut newest: Option<Update> = None;
     let (mut printed, mut is_stale) = (0, false);
     while options.count.is_none_or(|count| printed < count) && !(is_stale && options.until_stale) {
@@ -82,11 +83,8 @@ async fn watch(options: &WatchArguments) -> Result<Exit> {
             Ok(Ok(StreamEvent::Fresh(update) | StreamEvent::Stale(update))) => {
                 let is_new = newest.as_ref().map(id) != Some(id(&update));
                 is_stale = update.map.is_stale(now_ns());
-                let said = if is_new {
-                    line(&update, maps.passed_over(), options.json)
-                } else {
-                    stale_line(Some(&update), maps.passed_over(), options)
-                };
+                let said =
+                    if is_new { line(&update, &maps, options.json) } else { stale_line(Some(&update), &maps, options) };
                 newest = Some(update);
                 (said, is_new)
             }
@@ -102,7 +100,7 @@ async fn watch(options: &WatchArguments) -> Result<Exit> {
             Ok(Err(ended)) => {
                 if let Some(last) = newest.filter(|_| !is_stale) {
                     wait_until_stale(&last).await;
-                    print_line(&stale_line(Some(&last), maps.passed_over(), options))?;
+                    print_line(&stale_line(Some(&last), &maps, options))?;
                 }
                 return Err(explain(ended));
             }
@@ -110,7 +108,7 @@ async fn watch(options: &WatchArguments) -> Result<Exit> {
             Err(_) if newest.as_ref().is_some_and(|last| !last.map.is_stale(now_ns())) => continue,
             Err(_) => {
                 is_stale = true;
-                (stale_line(newest.as_ref(), maps.passed_over(), options), false)
+                (stale_line(newest.as_ref(), &maps, options), false)
             }
         };
         if !print_line(&said)? {
@@ -133,6 +131,34 @@ async fn wait_until_stale(last: &Update) {
     }
 }
 
+impl WatchArguments {
+    /// True if nothing but a person or the server ends the command.
+    fn is_endless(&self) -> bool {
+        self.count.is_none() && !self.until_stale
+    }
+}
+
+/// Subscribes; an endless command waits until a server answers.
+async fn subscribe_when_there(options: &WatchArguments) -> Result<MapStream> {
+    let mut said = String::new();
+    loop {
+        let error = match subscribe(options).await {
+            Ok(maps) => return Ok(maps),
+            Err(error) => error,
+        };
+        let is_away = matches!(error.downcast_ref(), Some(ClientError::Unreachable { .. }));
+        if !is_away || !options.is_endless() {
+            return Err(error);
+        }
+        let text = with_causes(&error);
+        if text != said {
+            eprintln!("clearway: {text}; waiting for it");
+            said = text;
+        }
+        tokio::time::sleep(STALE_PERIOD).await;
+    }
+}
+
 async fn subscribe(options: &WatchArguments) -> Result<MapStream> {
     let WatchArguments { zenoh, vehicle, layers, max_rate_hz, .. } = options;
     if let Some(endpoint) = zenoh {
@@ -142,28 +168,30 @@ async fn subscribe(options: &WatchArguments) -> Result<MapStream> {
         vehicle: vehicle.clone().unwrap_or_default(),
         layers: layers.clone(),
         max_rate_hz: *max_rate_hz,
+        reconnects: options.is_endless(),
         ..Subscription::default()
     };
     options.server.connect().await?.subscribe(subscription).await.map_err(explain)
 }
 
 /// The line for a new map.
-fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
-    let (map, skipped, now) = (&update.map, update.skipped, now_ns());
+fn line(update: &Update, maps: &MapStream, as_json: bool) -> String {
+    let (map, skipped, now, hostile) = (&update.map, update.skipped, now_ns(), maps.passed_over().hostile());
     let share = map.metric("drivable_share");
     if as_json {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
             "stale_because": map.staleness(now).map(|why| why.to_string()),
+            "reasons": maps.reasons(),
             "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
-            "lost": update.lost, "left_out": update.left_out, "passed_over": passed_over.hostile(),
+            "lost": update.lost, "left_out": update.left_out, "passed_over": hostile,
             "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
         });
         return document.to_string();
     }
     let share = share.map_or("    -".into(), |share| format!("{:5.1}", 100.0 * share));
     let stale = map.staleness(now).map_or(String::new(), |why| format!("  STALE: {why}"));
-    let passed_over = match passed_over.hostile() {
+    let passed_over = match hostile {
         0 => String::new(),
         messages => format!("  passed over {messages} messages that are no maps of this server"),
     };
@@ -176,21 +204,26 @@ fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
     )
 }
 
-/// The line while no fresh map is there: the newest one is stale, or none has come.
-fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &WatchArguments) -> String {
+/// The line while no fresh map is there: the newest one is stale, or none has come. It says why in the server's words,
+/// if there are any.
+fn stale_line(newest: Option<&Update>, maps: &MapStream, options: &WatchArguments) -> String {
+    let reasons = maps.reasons();
     match newest {
-        Some(update) if options.json => line(update, passed_over, true),
-        Some(Update { map, .. }) => format!(
-            "{} #{:06}  age {:7.1} ms  STALE: {}; waiting",
-            map.vehicle(),
-            map.sequence(),
-            map.age_ms(now_ns()),
-            map.staleness(now_ns()).unwrap_or(Staleness::NoNewer)
-        ),
-        None if options.json => {
-            json!({"vehicle": options.vehicle, "sequence": null, "age_ms": null, "stale": true}).to_string()
+        Some(update) if options.json => line(update, maps, true),
+        Some(Update { map, .. }) => {
+            let guess = || map.staleness(now_ns()).unwrap_or(Staleness::NoNewer).to_string();
+            let why = if reasons.is_empty() { guess() } else { reasons.join("; ") };
+            let (vehicle, sequence, age_ms) = (map.vehicle(), map.sequence(), map.age_ms(now_ns()));
+            format!("{vehicle} #{sequence:06}  age {age_ms:7.1} ms  STALE: {why}; waiting")
         }
-        None => "STALE: waiting for the first map (`clearway status` says why none has come)".to_owned(),
+        None if options.json => {
+            let vehicle = &options.vehicle;
+            json!({"vehicle": vehicle, "sequence": null, "age_ms": null, "stale": true, "reasons": reasons}).to_string()
+        }
+        None if reasons.is_empty() => {
+            "STALE: waiting for the first map (`clearway status` says why none has come)".to_owned()
+        }
+        None => format!("STALE: waiting for the first map: {}", reasons.join("; ")),
     }
 }
 

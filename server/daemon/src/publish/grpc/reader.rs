@@ -5,10 +5,12 @@
 //! on the way; without them the HTTP/2 windows alone hold about half a minute of maps.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use clearway_proto::v1;
 use futures::{Stream, StreamExt, stream};
 use tokio::sync::watch;
+use tokio::time::Interval;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
@@ -17,12 +19,14 @@ use crate::engine::acknowledgements::{AcknowledgingReader, MapId};
 use crate::engine::newest::Newest;
 use crate::engine::subscriptions::LayerSubscription;
 use crate::publish::served::{Served, Vehicles};
-use crate::status::{Reader, Transport};
-use crate::traces::Traces;
+use crate::status::{Reader, Transport, VehicleStatus};
 use clearway_journal::encode::EncodedMap;
 
+/// Time without an update after which a reader of states gets one.
+const STATE_PERIOD: Duration = Duration::from_secs(1);
+
 /// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the
-/// stream. `name` names the reader to people.
+/// stream, unless the selection has states. `name` names the reader to people.
 ///
 /// # Errors
 /// A status that names the vehicle, layer or value of the selection that is not allowed, and what is.
@@ -75,7 +79,9 @@ struct Watch<R> {
     finished: Option<AcknowledgingReader>,
     /// Until it goes, its layers are made.
     subscription: LayerSubscription,
-    traces: Traces,
+    status: Arc<VehicleStatus>,
+    /// When the reader gets the state of the vehicle; `None` if it does not want it.
+    states: Option<Interval>,
     transport: Transport,
     /// The reader is counted while this lives, and what it skips.
     reader: Reader,
@@ -100,7 +106,8 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             replay_ended,
             is_end_due,
             subscription: served.wires.subscriptions.subscribe(&selection.layers),
-            traces: served.status.traces.clone(),
+            status: served.status.clone(),
+            states: selection.states.then(|| tokio::time::interval(STATE_PERIOD)),
             transport,
             last: None,
             base: None,
@@ -112,7 +119,10 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     }
 
     fn updates(self) -> impl Stream<Item = Result<v1::MapUpdate, Status>> {
-        stream::try_unfold(self, |mut watch| async move { Ok(watch.next().await?.map(|update| (update, watch))) })
+        stream::try_unfold(self, |mut watch| async move {
+            watch.states.iter_mut().for_each(Interval::reset);
+            Ok(watch.next().await?.map(|update| (update, watch)))
+        })
     }
 
     /// The next update: the newest map that is due, as soon as there is a credit. `None` if the reader has
@@ -149,6 +159,10 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
                     }
                 },
                 Ok(()) = self.replay_ended.changed() => self.is_end_due = *self.replay_ended.borrow_and_update(),
+                () = tick(self.states.as_mut()) => {
+                    let vehicle = Some(self.status.to_proto());
+                    return Ok(Some(v1::MapUpdate { vehicle, sent_ns: now_ns(), ..Default::default() }));
+                }
             }
         }
     }
@@ -182,7 +196,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {
-        let _hop = self.traces.hop(&map, "send", Some(self.transport.as_str()));
+        let _hop = self.status.traces.hop(&map, "send", Some(self.transport.as_str()));
         let Self { selection, last, base, want_full, .. } = self;
         let is_base = |base: &&EncodedMap| !*want_full && base.boot_id == map.boot_id;
         let bytes = selection.bytes(&map, base.as_deref().filter(is_base))?;
@@ -193,7 +207,14 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         selection.credits.send(sent.sequence);
         (*base, *want_full) = (selection.deltas.then_some(map), false);
         let lockstep = self.finished.as_ref().is_some_and(AcknowledgingReader::is_in_lockstep);
-        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, replay_ended: false, lockstep })
+        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, lockstep, ..Default::default() })
+    }
+}
+
+async fn tick(interval: Option<&mut Interval>) {
+    match interval {
+        Some(interval) => _ = interval.tick().await,
+        None => std::future::pending().await,
     }
 }
 

@@ -26,6 +26,8 @@ pub struct Selection {
     pub region: Option<v1::Region>,
     /// True if layers may be sent as deltas.
     pub deltas: bool,
+    /// True if the state of the vehicle is sent while no map comes.
+    pub states: bool,
     /// Which maps are sent.
     pub rate: Rate,
     /// How many maps may be on the way.
@@ -39,7 +41,7 @@ impl Selection {
     /// `NotFound` for an unknown layer; `InvalidArgument` for a value that is not allowed, or a region outside the
     /// grids. Both name the value and what is allowed.
     pub fn new(served: &Served, selection: v1::Selection) -> Result<Self, Status> {
-        let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas } = selection;
+        let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas, states } = selection;
         served.check_layers(&layers)?;
         if max_in_flight > IN_FLIGHT_MAX {
             let text = format!("max_in_flight {max_in_flight}: 0 to {IN_FLIGHT_MAX} is allowed");
@@ -49,6 +51,7 @@ impl Selection {
             layers,
             region,
             deltas,
+            states,
             rate: Rate::new(max_rate_hz)?,
             credits: Credits::new(max_in_flight as usize),
         };
