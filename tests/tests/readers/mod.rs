@@ -2,6 +2,7 @@
 
 mod bad;
 mod browsers;
+mod interrupted;
 mod nav2;
 mod python;
 mod streams;

@@ -39,9 +39,10 @@ pub const OBSERVATION_REASONS: [&str; 13] = [
     "stamp_ahead",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.
-pub const CLOSE_REASONS: [&str; 14] = [
+pub const CLOSE_REASONS: [&str; 15] = [
     "accept_error",
     "calls",
+    "certificate_end",
     "denied",
     "flood",
     "handshake",

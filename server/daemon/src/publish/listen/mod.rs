@@ -255,8 +255,9 @@ impl Shared {
                 return None;
             }
         };
-        let certificate = stream.get_ref().1.peer_certificates().and_then(|chain| chain.first());
-        let names = certificate.map(|certificate| tls::names(certificate)).unwrap_or_default();
+        let chain = stream.get_ref().1.peer_certificates().unwrap_or_default();
+        let names = chain.first().map(|certificate| tls::names(certificate)).unwrap_or_default();
+        slot.set_certificate_end(tls::end_s(chain));
         if current.access.as_ref().is_some_and(|access| access.knows(&names)) {
             slot.set_known();
         }

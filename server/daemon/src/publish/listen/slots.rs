@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
 
 use super::access::Caller;
+use crate::base::clock::now_ns;
 use crate::base::sync::locked;
 use crate::config;
 
@@ -90,6 +91,8 @@ struct OpenConnection {
     has_requested: bool,
     idle_since: Instant,
     calls: BTreeMap<u64, Authorization>,
+    /// When the client's certificate ends, in seconds since the Unix epoch.
+    certificate_end_s: Option<i64>,
     closing: CancellationToken,
 }
 
@@ -100,6 +103,9 @@ impl OpenConnection {
 
     /// The reason to close the connection now.
     fn fault(&self, idle: Duration, now: Instant) -> Option<&'static str> {
+        if self.certificate_end_s.is_some_and(|end_s| now_ns() / 1_000_000_000 > end_s) {
+            return Some("certificate_end");
+        }
         let past = |since: Instant, limit| now.saturating_duration_since(since) > limit;
         match self.has_requested {
             false => past(self.opened, FIRST_REQUEST_TIMEOUT.min(idle)).then_some("no_request"),
@@ -214,7 +220,8 @@ impl ConnectionSlots {
         (0..most).take_while(|_| slots.close_idlest(|_| true)).count()
     }
 
-    /// Notes that the listener is at work, and closes the connections that have been idle for too long.
+    /// Notes that the listener is at work, and closes the connections that have been idle for too long or whose client
+    /// certificate has ended.
     pub fn sweep(&self) {
         let (mut slots, now) = (locked(&self.0), Instant::now());
         slots.heartbeat = Some(now);
@@ -245,6 +252,7 @@ impl ConnectionSlots {
             has_requested: false,
             idle_since: now,
             calls: BTreeMap::new(),
+            certificate_end_s: None,
             closing: closing.clone(),
         };
         slots.open.insert(number, connection);
@@ -289,6 +297,12 @@ impl ConnectionSlot {
         if !was_known && connection.refusal.is_some() && slots.make_room(self.peer, true).is_ok() {
             slots.open.get_mut(&self.number).into_iter().for_each(|connection| connection.refusal = None);
         }
+    }
+
+    /// The end of the certificate that the client has shown, in seconds since the Unix epoch.
+    pub fn set_certificate_end(&self, end_s: Option<i64>) {
+        let mut slots = locked(&self.slots.0);
+        slots.open.get_mut(&self.number).into_iter().for_each(|connection| connection.certificate_end_s = end_s);
     }
 
     /// Notes that a request has come; a connection over a limit still has to end in time.

@@ -77,7 +77,7 @@ fn parse_chain(what: &str, pem: &str) -> Result<Vec<CertificateDer<'static>>, St
 }
 
 /// The earliest end of these certificates, in seconds since the Unix epoch; `None` if none of them parses.
-fn end_s(chain: &[CertificateDer<'_>]) -> Option<i64> {
+pub fn end_s(chain: &[CertificateDer<'_>]) -> Option<i64> {
     let end = |der: &CertificateDer<'_>| Some(X509Certificate::from_der(der).ok()?.1.validity().not_after.timestamp());
     chain.iter().filter_map(end).min()
 }
