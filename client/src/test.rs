@@ -21,8 +21,8 @@ const POLL: Duration = Duration::from_millis(5);
 /// The file of what the server says.
 const LOG: &str = "log.txt";
 
-/// A recording that is replayed by a server of its own process, on free ports of this machine. Dropping it ends the
-/// server.
+/// A recording that is replayed by a server of its own process, on free ports of this machine. Dropping it, or the end
+/// of this process, however it ends, ends the server.
 #[derive(Debug)]
 pub struct Replay {
     server: Child,
@@ -113,7 +113,7 @@ impl Replay {
             .arg(&ready)
             .args(if options.contains(&"--wait-readers") { &[][..] } else { &["--wait-readers", "1"] })
             .args(options)
-            .stdin(Stdio::null())
+            .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(fs::File::create(&log).map_err(file(&log))?)
             .spawn()

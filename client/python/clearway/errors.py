@@ -22,3 +22,9 @@ class ReplayEnded(ClearwayError):
 
 class DecodeError(ClearwayError):
     """An invalid map. `reason` is the name in the golden vectors, the same in every client language."""
+
+
+def forked(what: str) -> ClearwayError:
+    """The error of a process that was forked from the one that opened `what`: its threads are there alone."""
+    text = f"{what} was opened before this process was forked, and works in the process that opened it alone: open it"
+    return ClearwayError("fork", f"{text} after the fork, or start processes with multiprocessing.get_context('spawn')")

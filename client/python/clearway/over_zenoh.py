@@ -11,13 +11,14 @@ what does not belong on the key is counted and passed over.
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from .errors import ClearwayError
+from .errors import ClearwayError, forked
 from .map import Map
 from .signature import PublicKey
 from .stream import LatestSlot, MapStream
@@ -52,6 +53,8 @@ _SETTINGS = {
     "transport/link/rx/max_message_size": 16777216,
     "transport/link/tcp": {"so_rcvbuf": 262144},
 }
+#: The process that has opened the first session.
+_process: int | None = None
 #: Names of certificates in a session's configuration.
 _CERTIFICATES = {"ca": "root_ca_certificate", "cert": "connect_certificate", "key": "connect_private_key"}
 
@@ -62,6 +65,7 @@ def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
         import zenoh
     except ImportError:
         raise ClearwayError("zenoh", "zenoh is not installed: pip install 'clearway[zenoh]'") from None
+    _check_not_forked()
     encrypted = {"so_rcvbuf": 262144}
     endpoints = endpoint.split("+" if "+" in endpoint else ",")
     if tls is not None:
@@ -86,6 +90,14 @@ def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
                 raise ClearwayError("zenoh", f"connect to {endpoint}: {error}") from None
         time.sleep(_OPEN_RETRY_S)
         open_timeout_ms = min(2 * open_timeout_ms, longest_ms)
+
+
+def _check_not_forked() -> None:
+    """Raises an error in a process that was forked from one with a session: zenoh has no threads there."""
+    global _process
+    _process = _process or os.getpid()
+    if _process != os.getpid():
+        raise forked("zenoh")
 
 
 def vehicles(endpoint: str, tls: Tls | None) -> list[str]:

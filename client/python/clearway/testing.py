@@ -54,7 +54,8 @@ class ReplayState(NamedTuple):
 
 
 class Replay:
-    """A recording that is replayed on free ports of this machine. `close`, or the end of a `with`, ends the server.
+    """A recording that is replayed on free ports of this machine. `close`, the end of a `with`, or the end of this
+    process, however it ends, ends the server.
 
     `options` are more options of `clearway replay`, such as "--speed", "0.5". A server that does not start is a
     `ClearwayError` with its message.
@@ -71,7 +72,7 @@ class Replay:
             with log.open("w") as stderr:
                 self._server = subprocess.Popen(
                     [command, "replay", os.fspath(recording), *arguments, *options],
-                    stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr,
+                    stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=stderr,
                 )  # fmt: skip
         except OSError as error:
             self._folder.cleanup()
@@ -169,6 +170,8 @@ class Replay:
         """Stops the server as a crash would: without a word to its readers."""
         self._server.kill()
         self._server.wait()
+        if self._server.stdin is not None:
+            self._server.stdin.close()
         if isinstance(self._log, Path):
             self._log = self._log.read_text()
         self._folder.cleanup()

@@ -2,7 +2,12 @@
 
 import math
 import os
+import shutil
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -82,3 +87,17 @@ def test_a_reader_over_zenoh_learns_why_a_replay_in_lockstep_has_failed(clearway
         with pytest.raises(clearway.ClearwayError, match="map 0 of vehicle car was not acknowledged within 0.5 s"):
             while next(maps):
                 pass
+
+
+def test_the_server_ends_with_the_process_that_started_it_also_if_that_is_killed():
+    program = (
+        "import os, clearway.testing; drive = clearway.testing.Replay(); "
+        "print(drive._folder.name, flush=True); os.kill(os.getpid(), 9)"
+    )
+    killed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert killed.returncode == -signal.SIGKILL, killed
+    # The server removes its ready file at its end.
+    ready, until = Path(killed.stdout.strip(), "ready.json"), time.monotonic() + 60
+    while ready.exists():
+        assert time.monotonic() < until, "the server runs on"
+    shutil.rmtree(ready.parent)

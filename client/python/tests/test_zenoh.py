@@ -161,6 +161,31 @@ def test_a_program_may_end_without_closing_its_stream(server, endpoint, ending):
     assert (run.returncode, run.stderr) == (3 if "raise" in ending else 0, "")
 
 
+def test_a_process_that_was_forked_is_told_so_and_ends(server, endpoint):
+    publisher = published(server)
+    publisher.put(part(3))
+    program = f"""
+import os, sys, clearway
+at = 'zenoh:{endpoint}'
+maps = clearway.watch(at, vehicle='alpha', layers=['drivability'])
+next(maps)
+child = os.fork()
+if child == 0:
+    for use in [maps.__next__, maps.next_or_stale, lambda: clearway.vehicles(at)]:
+        try:
+            use()
+        except clearway.ClearwayError as error:
+            print(error.reason, error)
+    maps.close()
+    sys.exit(5)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), maps.newest().sequence)
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    *told, last = run.stdout.splitlines()
+    assert last == "5 3" and len(told) == 3 and run.stderr == "", run
+    assert all(line.startswith("fork ") and "get_context('spawn')" in line for line in told), told
+
+
 class Wire:
     """A connection between client and server. While it is cut, no data pass and neither side is notified."""
 

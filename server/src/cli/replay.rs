@@ -1,5 +1,6 @@
 //! `clearway replay`: recorded drives -> maps, a recording, readers.
 
+use std::future::pending;
 use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,6 +12,9 @@ use clearway_daemon::replay::summary::why_no_map;
 use clearway_daemon::replay::{ReplayOptions, ReplayRun, ReplaySpeed, ReplaySummary, ServedReplay, describe};
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
+use tokio::io::AsyncReadExt;
+use tokio::net::unix::pipe;
+use tokio::time::timeout;
 
 use crate::cli::shared::configuration::extrinsics;
 use crate::cli::shared::exit::Exit;
@@ -107,7 +111,7 @@ struct ServedArguments {
     #[arg(long, value_name = "N", requires = "serve", default_value_t = 0, hide_default_value = true)]
     wait_readers: u32,
     /// Write the process id and the addresses to this new file as JSON once readers can connect; it is removed at the
-    /// end.
+    /// end. If a program holds stdin open as a pipe, the command ends with that program.
     #[arg(long, value_name = "FILE.json", requires = "serve")]
     ready_file: Option<PathBuf>,
     /// Listen on free ports of this machine only; --ready-file and the log say which.
@@ -126,6 +130,8 @@ impl From<ServedArguments> for ServedReplay {
     }
 }
 
+/// A pipe that is closed within this time was closed when the command began. Ours.
+const STDIN_CLOSED_MAX: Duration = Duration::from_millis(100);
 /// Greatest number of seconds, about 30 years. Ours.
 const SECONDS_MAX: f64 = 1e9;
 
@@ -156,7 +162,8 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
         return Err(usage_error(format!("--from {from} --to {to}: the range must end after it begins")));
     }
     let ReplayArguments { model, topics, config, set, faults, serve, served, .. } = arguments;
-    let served = serve.then(|| served.into());
+    let served: Option<ServedReplay> = serve.then(|| served.into());
+    let is_of_program = served.as_ref().is_some_and(|served| served.ready_file.is_some());
     let has_bar = !json && !serve && std::io::stderr().is_terminal();
     let options = ReplayOptions {
         files,
@@ -174,7 +181,14 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
         served,
     };
     let summary = block_on(async {
-        let stop = stop_signal()?;
+        let signal = stop_signal()?;
+        let closed = tokio::spawn(stdin_closed(is_of_program));
+        let stop = async {
+            tokio::select! {
+                () = signal => {}
+                _ = closed => {}
+            }
+        };
         let replay = ReplayRun::start(options).await?;
         if let Some(description) = describe(replay.mount()) {
             eprintln!("extrinsics {description}");
@@ -196,6 +210,18 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
         eprintln!("clearway: the {} made {which}: {}", summary.what, why_no_map(&summary.mount, &summary.snapshot));
     }
     Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
+}
+
+/// Returns when the pipe that is stdin is closed, if that `ends` the command; never if stdin is no pipe, or one that was
+/// closed from the start, as under cron.
+async fn stdin_closed(ends: bool) {
+    let stdin = pipe::OpenOptions::new().open_receiver("/dev/stdin").ok().filter(|_| ends);
+    let Some(mut stdin) = stdin else { return pending().await };
+    let mut ignored = [0; 64];
+    if timeout(STDIN_CLOSED_MAX, stdin.read(&mut ignored)).await.is_ok_and(|read| !matches!(read, Ok(1..))) {
+        return pending().await;
+    }
+    while matches!(stdin.read(&mut ignored).await, Ok(1..)) {}
 }
 
 /// Prints what is remarkable about the files on stderr; false if one of them is not whole.
