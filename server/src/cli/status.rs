@@ -75,13 +75,13 @@ fn lines(vehicle: &v1::Vehicle) -> Vec<String> {
         format!(", at {:.1} m, {:.1} m, heading {:.0} deg", pose.x_m, pose.y_m, pose.heading_deg)
     });
     let speed = vehicle.speed_m_s.map_or(String::new(), |speed| format!(", {speed:.1} m/s"));
+    let loss = vehicle.loss.map_or(String::new(), |loss| format!(", loss {:.1} %", 100.0 * loss));
     let readers: u32 = vehicle.readers.values().sum();
     let mut lines = vec![format!(
-        "{}: {}: {age}, {:.1} maps/s{total}, loss {:.1} %{share}, readers {readers}{pose}{speed}",
+        "{}: {}: {age}, {:.1} maps/s{total}{loss}{share}, readers {readers}{pose}{speed}",
         vehicle.name,
         vehicle.state.to_uppercase(),
         vehicle.map_rate_hz,
-        100.0 * vehicle.loss,
     )];
     lines.extend(vehicle.reasons.iter().map(|reason| format!("  {reason}")));
     lines
@@ -101,9 +101,10 @@ mod tests {
     #[test]
     fn what_is_not_known_is_not_printed() {
         let vehicle = v1::Vehicle { name: "car".into(), state: "error".into(), ..Default::default() };
-        assert_eq!(lines(&vehicle), ["car: ERROR: no map, 0.0 maps/s, loss 0.0 %, readers 0"]);
+        assert_eq!(lines(&vehicle), ["car: ERROR: no map, 0.0 maps/s, readers 0"]);
         let reasons = vec!["no packets from top for 76 s".into()];
-        let vehicle = v1::Vehicle { map_age_ms: Some(76_090.0), speed_m_s: Some(8.0), reasons, ..vehicle };
+        let vehicle =
+            v1::Vehicle { map_age_ms: Some(76_090.0), speed_m_s: Some(8.0), loss: Some(0.0), reasons, ..vehicle };
         let printed = lines(&vehicle).join("\n");
         let expected = "car: ERROR: newest map 76090 ms old, 0.0 maps/s, loss 0.0 %, readers 0, 8.0 m/s\n  no packets \
                         from top for 76 s";

@@ -153,7 +153,7 @@ fn row(vehicle: &v1::Vehicle, server: &str) -> String {
         truncate_str(&printable(&vehicle.name), 16, "…"),
         printable(&vehicle.state).to_uppercase(),
         vehicle.map_rate_hz,
-        format!("{:.1} %", 100.0 * vehicle.loss),
+        or_dash(vehicle.loss.map(|loss| format!("{:.1} %", 100.0 * loss))),
         vehicle.map_bytes / 1e3,
     )
 }
@@ -238,7 +238,7 @@ mod tests {
         let car = v1::Vehicle {
             map_age_ms: Some(93.4),
             map_rate_hz: 10.0,
-            loss: 0.012,
+            loss: Some(0.012),
             latency_ms: [("total".to_owned(), 41.6)].into(),
             map_bytes: 12_340.0,
             drivable_share: Some(0.625),

@@ -97,11 +97,11 @@ fn lines(vehicle: &v1::Vehicle, is_fleet: bool, now: i64) -> Vec<String> {
         lines.extend(vehicle.sensor_ledgers.get(&state.name).map(|ledger| format!("    {}", ledger_line(ledger))));
     }
     if let Some(ledger) = &vehicle.ledger {
-        let loss = 100.0 * vehicle.loss;
+        let loss = vehicle.loss.map_or("unknown".to_owned(), |loss| format!("{:.1} %", 100.0 * loss));
+        let kernel_drops = ledger.kernel_drops;
         lines.push(format!(
-            "  {}, by the kernel {}; lost or refused in the last 10 s: {loss:.1} %",
-            ledger_line(ledger),
-            ledger.kernel_drops
+            "  {}, by the kernel {kernel_drops}; lost or refused in the last 10 s: {loss}",
+            ledger_line(ledger)
         ));
         let roads_refused: u64 = ledger.roads_refused.values().sum();
         if ledger.poses + ledger.poses_refused + ledger.roads + roads_refused > 0 {
@@ -171,7 +171,8 @@ fn ledger_line(ledger: &v1::Ledger) -> String {
     let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
     let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
     format!(
-        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; dropped at the full queue {}",
-        ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
+        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; lost on the way {}, dropped at the \
+         full queue {}",
+        ledger.received, ledger.decoded, ledger.telemetry, ledger.missing, ledger.lost
     )
 }

@@ -31,8 +31,8 @@ pub struct Assessment {
     pub reasons: Vec<String>,
     /// Age of the newest map; `None` before the first.
     pub map_age_ms: Option<f64>,
-    /// Share of the packets of the last 10 s that were lost or refused, 0 to 1.
-    pub loss: f64,
+    /// Share of the packets of the last 10 s that were lost or refused, 0 to 1; `None` if none was expected.
+    pub loss: Option<f64>,
     /// Speed of the vehicle, if maps are made.
     pub speed_m_s: Option<f64>,
     /// Names of other servers that serve a vehicle of the same name.

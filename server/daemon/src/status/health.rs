@@ -76,8 +76,8 @@ pub struct Facts {
     pub replay_awaited: String,
     /// The sensors.
     pub sensors: Vec<SensorFacts>,
-    /// Share of the packets of the last 10 s that were lost or refused, 0 to 1.
-    pub loss: f64,
+    /// Share of the packets of the last 10 s that were lost or refused, 0 to 1; `None` if none was expected.
+    pub loss: Option<f64>,
     /// What is wrong with the recording.
     pub recorder_problem: Option<String>,
     /// What is wrong with the long-term store.
@@ -142,7 +142,7 @@ pub struct Health {
 impl Health {
     /// Assesses the vehicle at `facts.up`, which never goes back. True if the state has changed.
     pub fn update(&mut self, facts: &Facts) -> bool {
-        self.is_lossy = facts.loss > if self.is_lossy { LOSS_ENDS } else { LOSS_WARNS };
+        self.is_lossy = facts.loss > Some(if self.is_lossy { LOSS_ENDS } else { LOSS_WARNS });
         let findings = findings(facts, self.is_lossy);
         let found = findings.first().map_or(State::Ok, |worst| worst.state);
         let before = self.state;
@@ -184,8 +184,8 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
     for sensor in &facts.sensors {
         sensor_findings(sensor, facts.validity, &mut add);
     }
-    if is_lossy {
-        add(State::Warn, format!("{:.1} % of the packets of the last 10 s were lost or refused", 100.0 * facts.loss));
+    if let Some(loss) = facts.loss.filter(|_| is_lossy) {
+        add(State::Warn, format!("{:.1} % of the packets of the last 10 s were lost or refused", 100.0 * loss));
     }
     if let Some(problem) = &facts.recorder_problem {
         add(State::Warn, format!("recorder: {problem}"));

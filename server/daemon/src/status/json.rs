@@ -94,7 +94,7 @@ fn ledger_json(ledger: &v1::Ledger) -> Value {
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
         "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
         "points_dropped": ledger.points_dropped, "own_body": ledger.own_body, "through_body": ledger.through_body,
-        "blind": ledger.blind,
+        "blind": ledger.blind, "missing": ledger.missing,
         "poses": ledger.poses, "poses_refused": ledger.poses_refused,
         "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })

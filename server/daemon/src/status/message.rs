@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 
 use super::json::vehicle_json;
 use super::transports::Transport;
-use super::vehicle::VehicleStatus;
+use super::vehicle::{VehicleStatus, packet_counts};
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
 use crate::ingest::drops::UnknownSender;
@@ -30,8 +30,12 @@ impl VehicleStatus {
             maps: snapshot.maps,
             newest_capture_end_ns: snapshot.newest_capture_end_ns,
             sensors,
-            ledger: Some(ledger(&snapshot.ledger)),
-            sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
+            ledger: Some(ledger(&snapshot.ledger, packet_counts(&snapshot.sensors).missing)),
+            sensor_ledgers: snapshot
+                .sensors
+                .iter()
+                .map(|s| (s.name.clone(), ledger(&s.ledger, s.status.packets_lost)))
+                .collect(),
             recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
             unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
@@ -99,7 +103,7 @@ fn unknown_sender(sender: &UnknownSender) -> v1::UnknownSender {
     v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
 }
 
-fn ledger(ledger: &Ledger) -> v1::Ledger {
+fn ledger(ledger: &Ledger, missing: u64) -> v1::Ledger {
     v1::Ledger {
         received: ledger.received,
         decoded: ledger.decoded,
@@ -115,6 +119,7 @@ fn ledger(ledger: &Ledger) -> v1::Ledger {
         poses_refused: ledger.poses_refused,
         roads: ledger.roads,
         roads_refused: by_name(&ledger.roads_refused),
+        missing,
     }
 }
 

@@ -151,7 +151,7 @@ impl Metrics {
         let help = "Age of the newest map, from the end of its capture.";
         self.each("clearway_map_age_seconds", help, |of| Some(of.assessment.map_age_ms? / 1e3));
         let help = "Share of the packets of the last 10 s that were lost, dropped or refused.";
-        self.each("clearway_packet_loss_ratio", help, |of| Some(of.assessment.loss));
+        self.each("clearway_packet_loss_ratio", help, |of| of.assessment.loss);
         let help = "Maps per second of the last 10 s.";
         self.each("clearway_map_rate_hertz", help, |of| Some(of.snapshot.map_rate_hz));
         let help = "Mean size of an encoded map of the last 10 s.";
@@ -186,8 +186,10 @@ impl Metrics {
         self.each("clearway_recorder_lost_total", help, |of| {
             Some(of.status.recorder.get().map_or(0, |counts| counts.lost()) as f64)
         });
-        let help = "1 if the recording lacks nothing and the disk keeps up.";
-        self.each("clearway_recorder_healthy", help, |of| Some(one_if(of.status.recorder.get()?.problem().is_none())));
+        let help = "1 if this part of the recording lacks nothing and the disk keeps up.";
+        self.each("clearway_recorder_healthy", help, |of| {
+            of.status.recorder.get().map(|_| one_if(of.status.recorder_problem().is_none()))
+        });
         let help = "Events that survive a power cut.";
         self.each("clearway_recorder_durable_events", help, |of| {
             Some(of.status.recorder.get()?.durable_events(&of.status.name) as f64)
@@ -227,6 +229,10 @@ impl Metrics {
         let is_reloaded = self.all.first().map(|of| one_if(of.status.network.is_reloaded()));
         let help = "1 if the configuration was read again at the newest SIGHUP, or there was none; else 0.";
         self.single("clearway_config_last_reload_successful", help, is_reloaded);
+        let ends = self.all.first().map(|of| of.status.network.certificates()).unwrap_or_default();
+        let help = "End of a certificate since the Unix epoch, by its key in the configuration.";
+        let ends = ends.into_iter().map(|(key, end_s)| (vec![("key", key.to_owned())], end_s as f64));
+        self.text.family("clearway_certificate_end_timestamp_seconds", help, ends);
         let help = "Start of the process since the Unix epoch.";
         self.single("process_start_time_seconds", help, process.start_s);
         let help = "Memory of the process that is in use and not swapped out.";

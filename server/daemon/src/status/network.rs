@@ -56,6 +56,11 @@ impl Network {
         ends.clone_into(&mut locked(&self.certificates));
     }
 
+    /// When the certificates end, as [`Self::set_certificates`] was told.
+    pub fn certificates(&self) -> Vec<(&'static str, i64)> {
+        locked(&self.certificates).clone()
+    }
+
     /// Notes why the configuration was not read again; `None`: it was.
     pub fn set_refused_reload(&self, reason: Option<String>) {
         *locked(&self.refused_reload) = reason;

@@ -272,9 +272,9 @@ impl VehicleStatus {
         self.recorder.get_or_init(|| counts);
     }
 
-    /// What is wrong with the recording now; `None` if nothing is, or nothing is recorded.
+    /// What is wrong with the recording of the vehicle now; `None` if nothing is, or nothing is recorded.
     pub fn recorder_problem(&self) -> Option<String> {
-        self.recorder.get().and_then(|counts| counts.problem())
+        self.recorder.get().and_then(|counts| counts.problem_of(&self.name))
     }
 
     /// True if nothing of the vehicle has stopped or hangs.

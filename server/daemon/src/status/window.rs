@@ -81,13 +81,14 @@ impl Window {
         StageTimes::NAMES.into_iter().enumerate().filter_map(median).collect()
     }
 
-    /// Share of the expected packets that were lost on the way, dropped or refused, 0 to 1, with the counts of now.
-    pub fn loss(&self, now: PacketCounts) -> f64 {
-        let Some((_, first)) = self.counts.front() else { return 0.0 };
+    /// Share of the expected packets that were lost on the way, dropped or refused, 0 to 1, with the counts of now;
+    /// `None` if none was expected.
+    pub fn loss(&self, now: PacketCounts) -> Option<f64> {
+        let (_, first) = self.counts.front()?;
         // A dropped packet is missing as well, so the greater number counts each once.
         let missing = now.missing.saturating_sub(first.missing).max(now.dropped.saturating_sub(first.dropped));
         let expected = now.read.saturating_sub(first.read) + missing;
-        if expected == 0 { 0.0 } else { missing as f64 / expected as f64 }
+        (expected > 0).then(|| missing as f64 / expected as f64)
     }
 
     fn recent_maps(&self, now: Duration) -> impl Iterator<Item = &MapSample> {
@@ -132,15 +133,19 @@ mod tests {
     fn loss_counts_each_packet_once_and_forgets_after_ten_seconds() {
         let mut window = Window::default();
         let counts = |read, missing, dropped| PacketCounts { read, missing, dropped };
-        assert_eq!(window.loss(counts(5, 5, 5)), 0.0, "nothing to compare with");
+        assert_eq!(window.loss(counts(5, 5, 5)), None, "nothing to compare with");
         window.push_counts(ms(0), counts(0, 0, 0));
-        assert_eq!(window.loss(counts(90, 10, 4)), 0.1);
-        assert_eq!(window.loss(counts(90, 4, 10)), 0.1);
-        assert_eq!(window.loss(counts(0, 0, 7)), 1.0, "all are refused");
+        assert_eq!(window.loss(counts(90, 10, 4)), Some(0.1));
+        assert_eq!(window.loss(counts(90, 4, 10)), Some(0.1));
+        assert_eq!(window.loss(counts(0, 0, 7)), Some(1.0), "all are refused");
         for second in 1..=20 {
             window.push_counts(ms(1000 * second), counts(90 + 100 * second, 10, 4));
         }
-        assert_eq!(window.loss(counts(2090, 10, 4)), 0.0);
+        assert_eq!(window.loss(counts(2090, 10, 4)), Some(0.0));
+        for second in 21..=40 {
+            window.push_counts(ms(1000 * second), counts(2090, 10, 4));
+        }
+        assert_eq!(window.loss(counts(2090, 10, 4)), None, "nothing is sent any more");
         assert!(window.counts.len() <= 12, "{}", window.counts.len());
     }
 }

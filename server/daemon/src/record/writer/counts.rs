@@ -1,5 +1,6 @@
 //! The counts of a recorder, which every publisher of the status reads: offered, written, dropped, durable.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
@@ -46,6 +47,9 @@ struct Changing {
     /// Why the newest attempt to store a part failed, and since when attempts fail.
     store_problem: Option<(String, SystemTime)>,
     is_late: bool,
+    /// Number of dropped messages of each topic before this part and the failure that it follows: what was dropped
+    /// since is an alarm until the part ends.
+    dropped_before: Vec<u64>,
     /// The newest sign of life of the recorder's thread.
     beat: Instant,
     has_ended: bool,
@@ -61,13 +65,16 @@ impl Changing {
         self.status.topics.iter().map(|topic| topic.dropped).sum()
     }
 
-    fn problem(&self) -> Option<String> {
-        let (silent, lost) = (self.beat.elapsed(), self.lost());
+    /// What is wrong now with the recording of these topics.
+    fn problem(&self, topics: Range<usize>) -> Option<String> {
+        let silent = self.beat.elapsed();
+        let dropped = self.status.topics[topics.clone()].iter().map(|topic| topic.dropped).sum::<u64>();
+        let lost = dropped - self.dropped_before[topics].iter().sum::<u64>();
         let is_hung = silent > SILENT_MAX && !self.has_ended;
         let hung = || is_hung.then(|| format!("the disk has not answered for {} s", silent.as_secs()));
         let stopped = || (self.status.state == "stopped").then(|| "stopped by a request".to_owned());
         let late = || self.is_late.then(|| "the disk is too slow".to_owned());
-        let lost = || (lost > 0).then(|| format!("{lost} events and maps are lost to the recording"));
+        let lost = || (lost > 0).then(|| format!("{lost} events and maps are lost to this part of the recording"));
         self.reason.clone().or_else(hung).or_else(stopped).or_else(late).or_else(lost)
     }
 }
@@ -95,6 +102,7 @@ impl RecorderCounts {
             failure: None,
             store_problem: None,
             is_late: false,
+            dropped_before: vec![0; topics.len()],
             beat: Instant::now(),
             has_ended: false,
         };
@@ -163,6 +171,10 @@ impl RecorderCounts {
     pub(super) fn set_file(&self, file: String, part: u64) {
         let mut changing = locked(&self.changing);
         changing.folder = Path::new(&file).parent().map(Path::to_owned).unwrap_or_default();
+        // What was dropped since the disk has failed counts for the part that is then begun.
+        if changing.status.state != "failed" {
+            changing.dropped_before = changing.status.topics.iter().map(|topic| topic.dropped).collect();
+        }
         (changing.status.part, changing.reason) = (part, None);
         changing.set_state("recording", file);
     }
@@ -191,7 +203,13 @@ impl RecorderCounts {
 
     /// What is wrong with the recording now; `None` if nothing is.
     pub fn problem(&self) -> Option<String> {
-        locked(&self.changing).problem()
+        locked(&self.changing).problem(0..self.topics.len())
+    }
+
+    /// What is wrong with the recording of a vehicle now; `None` if nothing is.
+    pub fn problem_of(&self, vehicle: &str) -> Option<String> {
+        let number = self.vehicles.iter().position(|name| **name == *vehicle)?;
+        locked(&self.changing).problem(self.first_topics[number]..self.first_topics[number + 1])
     }
 
     /// What is wrong with the long-term store now; `None` if nothing is.
@@ -223,7 +241,7 @@ impl RecorderCounts {
         let changing = locked(&self.changing);
         let mut status = v1::RecorderStatus {
             lost: changing.lost(),
-            reason: changing.problem().unwrap_or_default(),
+            reason: changing.problem(0..self.topics.len()).unwrap_or_default(),
             ..changing.status.clone()
         };
         // A map has one message in each of its layers.
@@ -264,5 +282,36 @@ impl RecorderCounts {
         let problem = &mut locked(&self.changing).store_problem;
         let since = problem.take().map_or_else(SystemTime::now, |(_, since)| since);
         *problem = reason.map(|reason| (reason, since));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_loss_is_an_alarm_of_its_vehicle_until_the_part_ends() {
+        let vehicles = [("car".into(), vec!["speed"]), ("van".into(), Vec::new())];
+        let counts = RecorderCounts::new(&vehicles, RecordedMaps::default());
+        let begin = |part| counts.set_file(format!("{part}.mcap"), part);
+        let is_alarm = |lost: u64| {
+            let text = format!("{lost} events and maps are lost to this part of the recording");
+            assert_eq!((counts.problem_of("car"), counts.problem_of("van")), (Some(text), None));
+        };
+        let is_quiet = || assert_eq!((counts.problem_of("car"), counts.problem()), (None, None));
+        begin(1);
+        counts.add_dropped(counts.first_topic(0));
+        is_alarm(1);
+        begin(2);
+        is_quiet();
+        // What the failed disk did not take is named while the next part lasts.
+        counts.set_failed("the disk is full");
+        assert_eq!(counts.problem_of("van").as_deref(), Some("the disk is full"));
+        (0..2).for_each(|_| counts.add_dropped(counts.first_topic(0)));
+        begin(3);
+        is_alarm(2);
+        begin(4);
+        is_quiet();
+        assert_eq!(counts.lost(), 3, "the count stays");
     }
 }

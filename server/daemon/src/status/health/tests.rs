@@ -28,7 +28,7 @@ fn fine() -> Facts {
 }
 
 fn words(facts: &Facts) -> Vec<(&'static str, String)> {
-    findings(facts, facts.loss > LOSS_WARNS).into_iter().map(|of| (of.state.as_str(), of.text)).collect()
+    findings(facts, facts.loss > Some(LOSS_WARNS)).into_iter().map(|of| (of.state.as_str(), of.text)).collect()
 }
 
 #[test]
@@ -80,7 +80,7 @@ fn each_thing_that_is_wrong_has_its_words() {
         ("warn", "the host's clock is +0.9 s ahead of that of top", |f| f.sensors[0].clock_offset_ms = 900),
         ("warn", "the host's clock is -0.2 s ahead of that of top", |f| f.sensors[0].clock_offset_ms = -200),
         ("warn", "the clock of top is holdover", |f| f.sensors[0].clock = "holdover".into()),
-        ("warn", "4.2 % of the packets of the last 10 s were lost or refused", |f| f.loss = 0.042),
+        ("warn", "4.2 % of the packets of the last 10 s were lost or refused", |f| f.loss = Some(0.042)),
         ("warn", "1 part not yet in the store: no", |f| {
             f.store_problem = Some("1 part not yet in the store: no".into())
         }),
@@ -97,7 +97,7 @@ fn each_thing_that_is_wrong_has_its_words() {
 #[test]
 fn the_worst_stands_first() {
     let mut facts = fine();
-    facts.loss = 0.5;
+    facts.loss = Some(0.5);
     facts.map_age = Some(ms(9000));
     facts.sensors.iter_mut().for_each(|sensor| sensor.silent = Some(ms(9000)));
     let states: Vec<_> = words(&facts).into_iter().map(|(state, _)| state).collect();
@@ -179,12 +179,12 @@ fn a_state_gets_worse_at_once_and_better_after_three_seconds() {
 fn loss_warns_above_one_percent_and_until_it_is_below_half_a_percent() {
     let script: [Line; 7] = [
         (0, |_| {}),
-        (1000, |f| f.loss = 0.009),
-        (2000, |f| f.loss = 0.011),
-        (9000, |f| f.loss = 0.009),
-        (20_000, |f| f.loss = 0.006),
-        (30_000, |f| f.loss = 0.004),
-        (33_000, |f| f.loss = 0.009),
+        (1000, |f| f.loss = Some(0.009)),
+        (2000, |f| f.loss = Some(0.011)),
+        (9000, |f| f.loss = Some(0.009)),
+        (20_000, |f| f.loss = Some(0.006)),
+        (30_000, |f| f.loss = Some(0.004)),
+        (33_000, |f| f.loss = Some(0.009)),
     ];
     assert_eq!(play(&script), ["ok", "ok", "warn", "warn", "warn", "warn", "ok"]);
 }
