@@ -4,7 +4,7 @@
 #
 #   deploy/make-test-ca.sh FOLDER [DAYS [NAMES]]
 #
-# NAMES are further names of the server, such as DNS:clearway-router,DNS:vehicle.local,IP:192.168.1.10.
+# NAMES are further names of the server, such as DNS:clearway-router-a,DNS:vehicle.local,IP:192.168.1.10.
 # Gives FOLDER/ca.pem, and {server,reader,ingester,operator}.{pem,key}. Needs openssl.
 set -eu
 

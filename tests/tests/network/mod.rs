@@ -2,4 +2,5 @@
 
 mod fleet;
 mod machines;
+mod routers;
 mod servers;
