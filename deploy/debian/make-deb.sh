@@ -32,6 +32,7 @@ for unit in clearway.service clearway.socket; do
     install -D -m 644 "deploy/systemd/$unit" "$package/lib/systemd/system/$unit"
 done
 install -D -m 644 deploy/systemd/clearway.sysusers "$package/usr/lib/sysusers.d/clearway.conf"
+install -D -m 644 deploy/systemd/clearway.sysctl "$package/usr/lib/sysctl.d/60-clearway.conf"
 "$binary" completions bash | install -D -m 644 /dev/stdin "$package/usr/share/bash-completion/completions/clearway"
 "$binary" completions zsh | install -D -m 644 /dev/stdin "$package/usr/share/zsh/vendor-completions/_clearway"
 doc=$package/usr/share/doc/clearway

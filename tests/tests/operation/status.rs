@@ -109,11 +109,12 @@ fn every_alert_is_sound_fires_and_clears() {
     let read = |file: &str| {
         std::fs::read_to_string(format!("{}/../deploy/prometheus/{file}", env!("CARGO_MANIFEST_DIR"))).unwrap()
     };
-    let (rules, tests) = (read("alerts.yml"), read("alerts.test.yml"));
+    let (rules, tests, runbook) = (read("alerts.yml"), read("alerts.test.yml"), read("RUNBOOK.md"));
     let alerts: Vec<_> = rules.lines().filter_map(|line| line.trim().strip_prefix("- alert: ")).collect();
     assert!(alerts.len() >= 10, "{alerts:?}");
     for alert in alerts {
         assert_eq!(tests.matches(&format!("alertname: {alert}\n")).count(), 3, "{alert}: before, firing, cleared");
+        assert_eq!(runbook.matches(&format!("| `{alert}` |")).count(), 1, "{alert} has a line in the runbook");
     }
 }
 
@@ -132,8 +133,9 @@ async fn the_dashboard_and_the_alerts_use_metrics_that_a_server_has() {
         let words = text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
         let used: std::collections::BTreeSet<_> =
             words.filter(|word| word.starts_with("clearway_") || word.starts_with("process_")).collect();
-        // Of a sensor that has seen its ground.
-        for name in used.iter().filter(|name| !name.starts_with("clearway_mount_")) {
+        // Of a sensor that has seen its ground, and of a server with certificates.
+        let others = ["clearway_mount_", "clearway_certificate_"];
+        for name in used.iter().filter(|name| !others.iter().any(|other| name.starts_with(other))) {
             let is_there = metrics.lines().any(|line| line.split(['{', ' ']).next() == Some(*name));
             assert!(is_there, "{file}: {name} is no metric: {metrics}");
         }
