@@ -7,7 +7,7 @@ use crate::fixture::{start, within};
 async fn only_get_and_head_from_the_page_itself_are_answered() {
     let mut config = everything();
     config.connections.hosts = vec!["car.example".into()];
-    config.connections.origins = vec!["https://fleet.example".into()];
+    config.connections.origins = vec!["https://Fleet.example".into(), "file://".into()];
     let running = start(config).await;
     for address in [running.page, running.metrics, running.foxglove].map(Option::unwrap) {
         for method in ["DELETE", "POST", "PUT", "OPTIONS", "PATCH"] {
@@ -59,7 +59,7 @@ async fn only_get_and_head_from_the_page_itself_are_answered() {
         {
             assert_eq!(begin(address, &upgrade(path, origin)).await, "HTTP/1.1 403", "{origin}");
         }
-        for origin in ["http://localhost", "https://fleet.example"] {
+        for origin in ["http://localhost", "https://fleet.example", "file://"] {
             assert_eq!(begin(address, &upgrade(path, origin)).await, "HTTP/1.1 101", "{origin}");
         }
     }

@@ -95,9 +95,10 @@ impl Connections {
         if self.kept > 65_535 {
             return Err(ValueError::new("connections.kept", self.kept, "0 to 65535 connections"));
         }
-        let is_wrong = |origin: &&String| !origin.contains("://") || origin.ends_with('/');
+        // The pages of an Electron program, such as Foxglove's, have the origin `file://`.
+        let is_wrong = |origin: &&String| !origin.contains("://") || (origin.ends_with('/') && *origin != "file://");
         if let Some(origin) = self.origins.iter().find(is_wrong) {
-            let allowed = "origins such as \"https://fleet.example\", without a path";
+            let allowed = "origins such as \"https://fleet.example\" or \"file://\", without a path";
             return Err(ValueError::new("connections.origins", origin, allowed));
         }
         Ok(())

@@ -179,12 +179,13 @@ fn diagnostic(status: &VehicleStatus) -> Diagnostic {
     };
     let age = map_age_ms.map_or_else(|| "no map".to_owned(), |age_ms| format!("{age_ms:.0}"));
     let rate = format!("{:.1}", status.snapshot().map_rate_hz);
+    let loss = loss.map_or_else(|| "no packets".to_owned(), |loss| format!("{loss:.3}"));
     Diagnostic {
         level,
         name: format!("{NODE}: {}", status.name),
         message: reasons.join("; "),
         hardware_id: status.name.to_string(),
-        values: vec![("map_age_ms", age), ("map_rate_hz", rate), ("loss", format!("{loss:.3}"))],
+        values: vec![("map_age_ms", age), ("map_rate_hz", rate), ("loss", loss)],
     }
 }
 

@@ -54,7 +54,10 @@ pub fn check(
             .split_once("://")
             .filter(|(scheme, authority)| is_scheme(scheme) && authority.eq_ignore_ascii_case(host));
         let is_own = own.is_some();
-        if !is_own && !origins.contains(&origin) && !current.origins.iter().any(|listed| listed == origin) {
+        if !is_own
+            && !origins.contains(&origin)
+            && !current.origins.iter().any(|listed| listed.eq_ignore_ascii_case(origin))
+        {
             let text = format!("origin {origin:?}: the page itself, or an origin in connections.origins, is allowed");
             return Err(refuse(StatusCode::FORBIDDEN, text));
         }
