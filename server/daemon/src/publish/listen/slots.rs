@@ -18,8 +18,7 @@ use crate::config;
 
 /// Longest time from the connection to its first request, with the TLS handshake. Ours: every client sends at once.
 const FIRST_REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
-/// Most connections over the limit that are open at once to receive an error; others are closed without one. Ours: a
-/// small share of the file handles of a process.
+/// Most connections over the limit that are open at once to receive an error; others get none. Ours: few file handles.
 const REFUSED_MAX: usize = 16;
 
 /// The limits of one listener.
@@ -103,11 +102,10 @@ impl OpenConnection {
 
     /// The reason to close the connection now.
     fn fault(&self, idle: Duration, now: Instant) -> Option<&'static str> {
-        if self.certificate_end_s.is_some_and(|end_s| now_ns() / 1_000_000_000 > end_s) {
-            return Some("certificate_end");
-        }
         let past = |since: Instant, limit| now.saturating_duration_since(since) > limit;
+        let has_ended = self.certificate_end_s.is_some_and(|end_s| now_ns() / 1_000_000_000 > end_s);
         match self.has_requested {
+            _ if has_ended => Some("certificate_end"),
             false => past(self.opened, FIRST_REQUEST_TIMEOUT.min(idle)).then_some("no_request"),
             true => (self.calls.is_empty() && past(self.idle_since, idle)).then_some("idle"),
         }
@@ -213,15 +211,13 @@ impl ConnectionSlots {
         locked(&self.0).close(|connection| (!connection.calls.values().all(&is_allowed)).then_some("role_lost"));
     }
 
-    /// Closes up to `most` connections without a call, the idle ones first, to free their file handles. Returns how
-    /// many.
+    /// Closes up to `most` connections without a call, idle ones first, to free file handles; returns how many.
     pub fn free(&self, most: usize) -> usize {
         let mut slots = locked(&self.0);
         (0..most).take_while(|_| slots.close_idlest(|_| true)).count()
     }
 
-    /// Notes that the listener is at work, and closes the connections that have been idle for too long or whose client
-    /// certificate has ended.
+    /// Notes that the listener is at work, and closes the connections that are idle or whose certificate has ended.
     pub fn sweep(&self) {
         let (mut slots, now) = (locked(&self.0), Instant::now());
         slots.heartbeat = Some(now);
@@ -301,8 +297,7 @@ impl ConnectionSlot {
 
     /// The end of the certificate that the client has shown, in seconds since the Unix epoch.
     pub fn set_certificate_end(&self, end_s: Option<i64>) {
-        let mut slots = locked(&self.slots.0);
-        slots.open.get_mut(&self.number).into_iter().for_each(|connection| connection.certificate_end_s = end_s);
+        locked(&self.slots.0).open.get_mut(&self.number).into_iter().for_each(|of| of.certificate_end_s = end_s);
     }
 
     /// Notes that a request has come; a connection over a limit still has to end in time.
