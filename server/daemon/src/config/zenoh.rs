@@ -1,5 +1,6 @@
 //! The table `[zenoh]`: the session in which maps are published; and `[zenoh.ros2]`: maps as ROS 2 topics.
 
+use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -7,7 +8,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
-use super::ros::{DOMAIN_MAX, is_topic};
+use super::ros::{DOMAIN_MAX, Ros, is_topic};
 use super::vehicle::Vehicle;
 
 /// The table `[zenoh]`.
@@ -164,6 +165,13 @@ impl Ros2 {
         if !self.namespace.is_empty() && !is_name(&self.namespace) {
             return Err(ValueError::new("zenoh.ros2.namespace", &self.namespace, "such as \"/clearway\", or empty"));
         }
+        // Else what is seen around one vehicle would be drawn around another.
+        let mut frames = BTreeSet::new();
+        let mut tables = vehicles.iter().filter_map(|vehicle| vehicle.ros.as_ref());
+        if let Some(Ros { ego_frame, .. }) = tables.find(|ros| !frames.insert(&ros.ego_frame)) {
+            let allowed = "with zenoh.ros2.enabled: a different frame for each vehicle";
+            return Err(ValueError::new("vehicle.ros.ego_frame", ego_frame, allowed));
+        }
         match vehicles.iter().find(|vehicle| !is_name(&format!("/{}", vehicle.name))) {
             None => Ok(()),
             Some(vehicle) => {
@@ -171,5 +179,24 @@ impl Ros2 {
                 Err(ValueError::new("vehicle.name", &vehicle.name, allowed))
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_vehicles_of_one_frame_are_refused_if_ros2_is_enabled() {
+        let vehicle = |name: &str, ego_frame: &str| {
+            let mut vehicle = crate::config::Config::of_one_vehicle(name, "top").vehicles.remove(0);
+            vehicle.ros = Some(Ros { ego_frame: ego_frame.to_owned(), ..Ros::default() });
+            vehicle
+        };
+        let ros2 = Ros2 { enabled: true, ..Ros2::default() };
+        let check = |frame: &str| ros2.check(true, &[vehicle("car", "base_link"), vehicle("truck", frame)]);
+        assert!(check("truck/base_link").is_ok());
+        let refused = check("base_link").unwrap_err();
+        assert_eq!((refused.key.as_str(), refused.value.as_str()), ("vehicle.ros.ego_frame", "base_link"));
     }
 }

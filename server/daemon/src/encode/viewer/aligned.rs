@@ -8,7 +8,7 @@
 
 use nalgebra::{Isometry3, Point2, Vector3};
 
-use super::raster::{Raster, UNKNOWN, rank};
+use super::raster::{Raster, UNKNOWN, is_free, rank};
 
 /// Occupancies of square cells along the axes of a frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -49,18 +49,26 @@ impl AlignedGrid {
             let inside = at.x >= 0.0 && at.x < f64::from(width) && at.y >= 0.0 && at.y < f64::from(height);
             inside.then(|| at.y as usize * width as usize + at.x as usize)
         };
-        let at_middle = |cell: u32| {
-            let (column, row) = (cell % width, cell / width);
-            let middle = source(first.x + f64::from(column) + 0.5, first.y + f64::from(row) + 0.5);
-            index(middle, columns, rows).map_or(UNKNOWN, |cell| occupancies[cell])
-        };
-        let mut placed_cells: Vec<i8> = (0..width * height).map(at_middle).collect();
-        for (cell, &occupancy) in (0..columns * rows).zip(occupancies) {
-            let middle = placed(f64::from(cell % columns) + 0.5, f64::from(cell / columns) + 0.5);
-            if let Some(cell) = index(middle - first.coords, width, height) {
-                placed_cells[cell] = std::cmp::max_by_key(placed_cells[cell], occupancy, |occupancy| rank(*occupancy));
+        let mut cells = Vec::with_capacity(width as usize * height as usize);
+        for row in 0..height {
+            let start = source(first.x + 0.5, first.y + f64::from(row) + 0.5);
+            let at_middle = |column: u32| {
+                let by = f64::from(column);
+                let middle = Point2::new(start.x + by * cos, start.y - by * sin);
+                index(middle, columns, rows).map_or(UNKNOWN, |cell| occupancies[cell])
+            };
+            cells.extend((0..width).map(at_middle));
+        }
+        for (row, of_row) in (0..rows).zip(occupancies.chunks_exact(columns as usize)) {
+            let start = placed(0.5, f64::from(row) + 0.5) - first.coords;
+            for (column, &occupancy) in (0..columns).zip(of_row).filter(|(_, occupancy)| !is_free(**occupancy)) {
+                let by = f64::from(column);
+                let middle = Point2::new(start.x + by * cos, start.y + by * sin);
+                if let Some(cell) = index(middle, width, height) {
+                    cells[cell] = std::cmp::max_by_key(cells[cell], occupancy, |occupancy| rank(*occupancy));
+                }
             }
         }
-        Self { origin_m: [first.x * edge_m, first.y * edge_m], width, height, occupancies: placed_cells }
+        Self { origin_m: [first.x * edge_m, first.y * edge_m], width, height, occupancies: cells }
     }
 }

@@ -151,6 +151,11 @@ impl Samples {
     }
 }
 
+/// True for the occupancy of a free cell, graded or not.
+pub(super) fn is_free(occupancy: i8) -> bool {
+    (FREE..OCCUPIED).contains(&occupancy)
+}
+
 /// Order from the best to the worst occupancy: unknown is worse than free, and better than an obstacle.
 pub(super) fn rank(occupancy: i8) -> i8 {
     if occupancy == UNKNOWN { OCCUPIED - 1 } else { occupancy }
