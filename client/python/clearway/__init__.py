@@ -54,8 +54,9 @@ def watch(
     as old as it was when it was made, plus the time since it came: for a replay that keeps the recorded stamps. With
     `reconnect`, the stream waits for a server that is not there, at the start and later, with pauses of 0.1 to 5 s;
     `MapStream.reasons` and the log "clearway" say so. Errors of the server are raised by the first `next`; for an
-    unknown vehicle or layer the message lists the known ones. For zenoh, which always reconnects: with `signed_by`, the PEM file of a server's public key, only maps that this server has signed are believed;
-    `MapStream.passed_over` counts the others.
+    unknown vehicle or layer the message lists the known ones. For zenoh, which always reconnects: with `signed_by`, the
+    PEM file of a server's public key, only maps that this server has signed are believed; `MapStream.passed_over`
+    counts the others.
     """
     _check_signed_by(address, signed_by)
     layers = _names(layers)

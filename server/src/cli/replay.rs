@@ -212,8 +212,8 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
 }
 
-/// Returns when the pipe that is stdin is closed, if that `ends` the command; never if stdin is no pipe, or one that was
-/// closed from the start, as under cron.
+/// Returns when the pipe that is stdin is closed, if that `ends` the command; never if stdin is no pipe, or a pipe that
+/// was closed from the start, as under cron.
 async fn stdin_closed(ends: bool) {
     let stdin = pipe::OpenOptions::new().open_receiver("/dev/stdin").ok().filter(|_| ends);
     let Some(mut stdin) = stdin else { return pending().await };
