@@ -160,7 +160,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
                 },
                 Ok(()) = self.replay_ended.changed() => self.is_end_due = *self.replay_ended.borrow_and_update(),
                 () = tick(self.states.as_mut()) => {
-                    let vehicle = Some(self.status.to_proto());
+                    let vehicle = Some(Box::new(self.status.to_proto()));
                     return Ok(Some(v1::MapUpdate { vehicle, sent_ns: now_ns(), ..Default::default() }));
                 }
             }
