@@ -2,6 +2,7 @@
 
 mod bad;
 mod browsers;
+mod cpp;
 mod interrupted;
 mod nav2;
 mod python;

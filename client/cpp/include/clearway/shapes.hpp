@@ -1,0 +1,160 @@
+// The shapes that questions are about: polygons of ground, outlines of vehicles, paths.
+//
+// In: values in the ego frame (x forward, y left, metres, radians). Out: checked corners and poses, or an `Error` with
+// the value that is not allowed. The reasons and the poses are equal to those of the Rust and the Python client.
+#pragma once
+
+#include <array>
+#include <cstdio>
+
+#include "grid.hpp"
+
+namespace clearway {
+
+// Corners of an area of ground, in order. Edges may touch, and must not cross.
+using Polygon = std::vector<Point>;
+
+// A path of constant curvature from the ego origin, straight ahead at its beginning.
+struct Arc {
+    // Curvature in 1/m, positive to the left; 0 is a straight line.
+    double curvature_per_m = 0;
+    // Length in metres; negative if the vehicle drives backwards.
+    double length_m = 0;
+};
+
+// An arc, or places between which the vehicle drives straight, heading along each stretch.
+using Path = std::variant<Arc, std::vector<Point>>;
+
+namespace shapes {
+
+// Most corners of a polygon and places of a path, longest path, and greatest distance between two judged poses.
+inline constexpr std::size_t CORNERS_MAX = 1000;
+inline constexpr double PATH_M_MAX = 1000.0;
+inline constexpr double STEP_M = 0.1;
+
+inline void check_finite(const std::string& what, double value) {
+    if (!std::isfinite(value)) {
+        throw Error("not_finite", what + " is " + std::to_string(value) + "; a finite number is needed");
+    }
+}
+
+inline void check_length(const std::string& what, double value, double most = HUGE_VAL) {
+    check_finite(what, value);
+    if (value < 0 || value > most) {
+        const std::string allowed = most == HUGE_VAL ? "0 or more" : "0 to 1000";
+        throw Error("length", what + " is " + std::to_string(value) + " m; " + allowed + " m is allowed");
+    }
+}
+
+// One pose of a path.
+struct PathPose {
+    // Distance along the path from its beginning, in metres.
+    double along_m = 0;
+    Point place;
+    double heading_rad = 0;
+};
+
+// The places without repetitions of the place before.
+inline std::vector<Point> distinct(const std::vector<Point>& given, bool is_polygon) {
+    const std::string one = is_polygon ? "corner " : "place ";
+    std::vector<Point> places;
+    for (std::size_t at = 0; at < given.size(); ++at) {
+        check_finite(one + std::to_string(at) + ", x", given[at].x_m);
+        check_finite(one + std::to_string(at) + ", y", given[at].y_m);
+        if (places.empty() || places.back() != given[at]) places.push_back(given[at]);
+    }
+    if (is_polygon && places.size() > 1 && places.front() == places.back()) places.pop_back();
+    const std::size_t least = is_polygon ? 3 : 2;
+    if (places.size() < least || places.size() > CORNERS_MAX) {
+        throw Error("places", std::string(is_polygon ? "polygon" : "path") + " has " + std::to_string(places.size()) +
+                                  " different places; " + std::to_string(least) + " to 1000 are needed");
+    }
+    return places;
+}
+
+// Corners of a polygon, checked; a last corner that repeats the first is left out.
+inline Polygon corners_of(const Polygon& polygon) {
+    const Polygon corners = distinct(polygon, true);
+    const auto after = [&](std::size_t at) { return corners[(at + 1) % corners.size()]; };
+    const auto side = [](Point a, Point b, Point p) {
+        return (b.x_m - a.x_m) * (p.y_m - a.y_m) - (b.y_m - a.y_m) * (p.x_m - a.x_m);
+    };
+    const auto are_parted = [](double a, double b) { return (a > 0 && b < 0) || (a < 0 && b > 0); };
+    for (std::size_t one = 0; one < corners.size(); ++one) {
+        for (std::size_t other = one + 1; other < corners.size(); ++other) {
+            const Point a = corners[one], b = after(one), c = corners[other], d = after(other);
+            const double start = side(a, b, c), end = side(a, b, d);
+            if (!are_parted(start, end) || !are_parted(side(c, d, a), side(c, d, b))) continue;
+            const double share = start / (start - end);
+            char near[80];
+            std::snprintf(near, sizeof near, "(%.3f, %.3f)", c.x_m + share * (d.x_m - c.x_m),
+                          c.y_m + share * (d.y_m - c.y_m));
+            throw Error("crossing", "edges " + std::to_string(one) + " and " + std::to_string(other) +
+                                        " of the polygon cross near " + near +
+                                        " m; a polygon that does not cross itself is needed");
+        }
+    }
+    return corners;
+}
+
+inline std::vector<PathPose> poses_of(const Arc& arc) {
+    check_finite("curvature_per_m", arc.curvature_per_m);
+    check_finite("length_m", arc.length_m);
+    check_length("the path", std::abs(arc.length_m), PATH_M_MAX);
+    const double steps = std::max(1.0, std::ceil(std::abs(arc.length_m) / STEP_M));
+    std::vector<PathPose> poses;
+    for (double step = 0; step <= steps; ++step) {
+        const double along_m = step / steps * arc.length_m;
+        const double heading_rad = arc.curvature_per_m * along_m;
+        // Both forms of the chord are exact; the second one has no division by a small curvature.
+        const double half = heading_rad / 2.0;
+        const double chord_m = std::abs(half) < 1e-9 ? along_m : along_m * std::sin(half) / half;
+        const Point place{chord_m * std::cos(half), chord_m * std::sin(half)};
+        poses.push_back({std::abs(along_m), place, std::fmod(heading_rad, TAU)});
+    }
+    return poses;
+}
+
+inline std::vector<PathPose> poses_of(const std::vector<Point>& given) {
+    const std::vector<Point> places = distinct(given, false);
+    std::vector<PathPose> poses;
+    double before_m = 0;
+    for (std::size_t at = 0; at + 1 < places.size(); ++at) {
+        const Point a = places[at];
+        const double dx = places[at + 1].x_m - a.x_m, dy = places[at + 1].y_m - a.y_m;
+        const double stretch_m = std::hypot(dx, dy);
+        check_length("the path", before_m + stretch_m, PATH_M_MAX);
+        const double steps = std::max(1.0, std::ceil(stretch_m / STEP_M));
+        for (double step = 0; step <= steps; ++step) {
+            const double share = step / steps;
+            const Point place{a.x_m + share * dx, a.y_m + share * dy};
+            poses.push_back({before_m + share * stretch_m, place, std::atan2(dy, dx)});
+        }
+        before_m += stretch_m;
+    }
+    return poses;
+}
+
+}  // namespace shapes
+
+// Outline of a vehicle about its reference point, in metres.
+struct Outline {
+    double front_m = 0, rear_m = 0, width_m = 0;
+
+    // The corners of the vehicle with its reference point at a place, counter-clockwise from the front right.
+    Polygon at(Point place, double heading_rad) const {
+        const double sin = std::sin(heading_rad), cos = std::cos(heading_rad), left = width_m / 2.0;
+        const auto corner = [&](double ahead, double side) {
+            return Point{place.x_m + ahead * cos - side * sin, place.y_m + ahead * sin + side * cos};
+        };
+        return {corner(front_m, -left), corner(front_m, left), corner(-rear_m, left), corner(-rear_m, -left)};
+    }
+
+    void check() const {
+        shapes::check_length("front_m", front_m);
+        shapes::check_length("rear_m", rear_m);
+        shapes::check_length("width_m", width_m);
+    }
+};
+
+}  // namespace clearway
