@@ -30,7 +30,7 @@ fn compiled(folder: &Path, source: &str) -> PathBuf {
         compiler.arg(&program).arg(format!("client/cpp/{source}")).args(options).current_dir(REPOSITORY);
         compiler.output().expect("c++ runs")
     };
-    let sanitized = compile(&["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]);
+    let sanitized = compile(&["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-D_GLIBCXX_ASSERTIONS"]);
     if !sanitized.status.success() {
         let output = compile(&[]);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
