@@ -139,6 +139,20 @@ impl Bits {
         }
     }
 
+    /// Replaces the bits by the cells of `from` and the eight around each. `wide` is a buffer.
+    pub fn grow(&mut self, from: &Self, wide: &mut Vec<u64>) {
+        self.clear();
+        wide.resize(from.stride, 0);
+        for (iy, row) in from.words.chunks_exact(from.stride).enumerate() {
+            wide.copy_from_slice(row);
+            dilate_by_one(wide);
+            let to = iy.saturating_sub(1) * from.stride..((iy + 2) * from.stride).min(from.words.len());
+            for row in self.words[to].chunks_exact_mut(from.stride) {
+                row.iter_mut().zip(&*wide).for_each(|(word, wide)| *word |= wide);
+            }
+        }
+    }
+
     /// Spreads set bits to neighbours along sides of cells as long as they are set in `open`.
     pub fn flood(&mut self, open: &Self) {
         let rows = open.words.len() / open.stride;

@@ -338,6 +338,11 @@ impl Reach {
         self.polar_of_cell[cell]
     }
 
+    /// Writes the lowest bit of the value of each cell's polar cell.
+    pub(crate) fn copy_polar(&self, value_of: impl Fn(PolarIndex) -> u8 + Copy, cells: &mut Bits) {
+        cells.fill_words(|of_word| self.polar_runs.bits::<1>(of_word.start / WORD, value_of)[0]);
+    }
+
     /// Floods the ground again with more barred cells; `flood` and `barred` are the caller's.
     pub(crate) fn flood_with(&self, barriers: [&Bits; 2], barred: &mut Bits, flood: &mut Flood) {
         barred.copy_from(&self.barred);

@@ -57,7 +57,7 @@ fn without_points_all_but_the_vehicle_is_unknown() {
 
 #[test]
 fn every_cell_of_open_level_ground_is_free_whether_a_return_fell_into_it_or_not() {
-    for (model, to_m) in [(Model::Hdl64eS2, 30.0), (Model::Hdl32e, 20.0), (Model::Vlp16, 15.0)] {
+    for (model, to_m) in [(Model::Hdl64eS2, 30.0), (Model::Hdl32e, 20.0), (Model::Vlp16, 14.0)] {
         let layer = freespace(&cast(model, plain));
         let is_near = |cell: &usize| libm::hypotf(centre(*cell)[0], centre(*cell)[1]) < to_m;
         let (why, mut reasons) = (values(&layer, "why"), [0; 2]);
@@ -92,6 +92,50 @@ fn the_body_of_a_car_ahead_is_not_free_however_little_of_its_rear_is_seen() {
             assert!(free <= 5, "{model:?}, {rear_m} m: {free} of 60 cells");
         }
     }
+}
+
+#[test]
+fn a_box_of_half_a_metre_that_no_ray_meets_is_not_free() {
+    for model in [Model::Vlp16, Model::Hdl32e] {
+        let mut unmet = 0;
+        for at_m in (24..100).map(|halves| halves as f32 * 0.5) {
+            let is_in = |x: f32, y: f32| (at_m..at_m + 1.0).contains(&x) && y.abs() < 1.0;
+            let sweep = cast(model, |x, y, z| z <= if is_in(x, y) { 0.5 } else { 0.0 });
+            // A row of the ground's estimate is as deep as a twentieth of its range.
+            let mut places = sweep.x.iter().zip(&sweep.y);
+            if !places.any(|(x, y)| (0.95 * at_m..at_m + 1.0).contains(x) && y.abs() < 1.0) {
+                unmet += 1;
+                let free = count(&freespace(&sweep), FreespaceClass::Free, [at_m, at_m + 1.0], [-1.0, 1.0]);
+                assert_eq!(free, 0, "{model:?}, {at_m} m");
+            }
+        }
+        assert!(unmet >= 3, "{model:?}: {unmet} boxes between two rays");
+    }
+}
+
+#[test]
+fn gaps_between_posts_are_occupied_and_ground_far_from_free_cells_is_wide() {
+    // Posts of 0.25 m, half a metre apart, around a yard, and a field behind it.
+    let post = |x: f32, y: f32| (8.0..8.25).contains(&x.abs().max(y.abs())) && (x + y).rem_euclid(0.75) < 0.25;
+    let layer = freespace(&cast(Model::Hdl64eS2, |x, y, z| z <= if post(x, y) { 1.5 } else { 0.0 }));
+    let class = |cell: usize| classes(&layer)[cell];
+    let around = |cell: usize| [-513, -512, -511, -1, 0, 1, 511, 512, 513].map(|by| cell.wrapping_add_signed(by));
+    let heights = values(&layer, "height");
+    let (mut ground, mut filled) = (0, 0);
+    for cell in (0..512 * 512).filter(|cell| (1..511).contains(&(cell % 512)) && (1..511).contains(&(cell / 512))) {
+        let is_occupied = |cell: usize| class(cell) == FreespaceClass::Occupied.value();
+        let is_gap = [1, 512].iter().any(|by| is_occupied(cell - by) && is_occupied(cell + by));
+        let is_open = [FreespaceClass::Unknown, FreespaceClass::Hidden, FreespaceClass::NotReached];
+        assert!(!is_gap || is_open.iter().all(|open| class(cell) != open.value()), "{:?}", centre(cell));
+        filled += usize::from(is_occupied(cell) && heights[cell] == i32::from(i8::MIN));
+        if class(cell) != FreespaceClass::NotReached.value() || around(cell).iter().any(|cell| is_free(&layer, *cell)) {
+            continue;
+        }
+        ground += 1;
+        let is_whole = |cell: usize| around(cell).iter().all(|cell| class(*cell) == FreespaceClass::NotReached.value());
+        assert!(around(cell).into_iter().any(is_whole), "{:?}", centre(cell));
+    }
+    assert!(ground > 100 && filled > 0, "{ground} cells of ground behind the posts, {filled} of gaps");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! What was found of each cell -> the values of its channels.
 //!
-//! In: closed, low, dropping, free and hidden cells, a bit each. Out: class, height and reason of every cell, in the
+//! In: the cells of each class, a bit each. Out: class, height and reason of every cell, in the
 //! order of the grid.
 
 use crate::layer::maker::Context;
@@ -19,6 +19,8 @@ const OVERHANG_M_MIN: f32 = 1.0;
 pub struct Findings<'a> {
     /// What the vehicle can reach.
     pub reach: &'a Reach,
+    /// The cells to call occupied, not reached and hidden, in this order.
+    pub blocked: [&'a Bits; 3],
     /// The cells with something low.
     pub low: &'a Bits,
     /// The cells of drops.
@@ -31,7 +33,8 @@ impl Findings<'_> {
     /// Writes the class of each cell but those of the vehicle.
     pub fn write_classes(&self, class: &mut Vec<u8>) {
         let bits = self.reach.bits();
-        let planes = [self.free, bits.in_trough, bits.closed, self.drop, self.low, bits.open, bits.hidden];
+        let [occupied, not_reached, hidden] = self.blocked;
+        let planes = [self.free, bits.in_trough, occupied, self.drop, self.low, not_reached, hidden];
         // The first plane with the cell's bit decides.
         const CLASSES: [FreespaceClass; 7] = [
             FreespaceClass::Free,
@@ -81,7 +84,8 @@ impl Findings<'_> {
             let obstacle = || match self.reach.obstacle_span_m(cell) {
                 Some([low, _]) if low >= OVERHANG_M_MIN => Reason::Overhang,
                 Some(_) => Reason::Obstacle,
-                None => Reason::Step,
+                None if is(bits.closed) => Reason::Step,
+                None => Reason::Obstacle,
             };
             let reason = match *class {
                 class if class == FreespaceClass::Free.value() => match () {

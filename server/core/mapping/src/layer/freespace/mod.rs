@@ -10,7 +10,9 @@
 //! | what stands over the ground on both sides of it -> low cells | `low_things` |
 //! | returns that lie deeper than the ground before them -> cells of drops | `drops` |
 //! | the reach stage's flood, with these cells as barriers -> covered cells | [`crate::reach`] |
+//! | gaps between rays that pass too high -> cells that are not free | `unproved` |
 //! | even cells beside a step -> free cells | `releases` |
+//! | gaps and patches too small for a vehicle -> occupied and hidden cells | `patches` |
 //! | all of it -> the class of each cell, and if configured its height and its reason | `cells` |
 
 mod cells;
@@ -18,7 +20,9 @@ pub mod class;
 pub mod config;
 mod drops;
 mod low_things;
+mod patches;
 mod releases;
+mod unproved;
 
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::count_cells;
@@ -37,6 +41,8 @@ use class::{FreespaceClass, HEIGHT, WHY};
 use config::FreespaceConfig;
 use drops::Drops;
 use low_things::LowThings;
+use patches::Patches;
+use unproved::Unproved;
 
 /// Distance to the vehicle's outline within which nothing is low and no drop is found, metres. Ours: the returns of the
 /// vehicle's own sides.
@@ -48,6 +54,8 @@ pub struct Freespace {
     config: FreespaceConfig,
     low_things: LowThings,
     drops: Drops,
+    unproved: Unproved,
+    patches: Patches,
     flood: Flood,
     barred: Bits,
     low: Bits,
@@ -70,6 +78,8 @@ impl Freespace {
             config: config.clone(),
             low_things: LowThings::new(),
             drops: Drops::new(),
+            unproved: Unproved::new(),
+            patches: Patches::new(),
             flood: Flood::new(SIDE),
             barred: bits.clone(),
             low: bits.clone(),
@@ -106,8 +116,10 @@ impl Freespace {
     }
 
     /// Finds which cells are free, and what closes the others.
-    fn find(&mut self, sweep: &Sweep, context: &Context<'_>, reach: &Reach) {
-        let Self { low_things, drops, flood, barred, low, drop, free, stepped, released, own, .. } = self;
+    fn find<'a>(&'a mut self, sweep: &Sweep, context: &Context<'_>, reach: &'a Reach) -> Findings<'a> {
+        let Self {
+            low_things, drops, unproved, patches, flood, barred, low, drop, free, stepped, released, own, ..
+        } = self;
         low.copy_from(low_things.find(reach));
         low.remove(own);
         match context.ground {
@@ -120,11 +132,15 @@ impl Freespace {
         free.copy_from(covered);
         [reach.bits().closed, &*low, &*drop].into_iter().for_each(|closed| free.remove(closed));
         free.remove(reach.outside());
+        let unproved = unproved.find(context.ground, reach, sweep.mount_height_m);
+        free.remove(unproved);
         reach.only_stepped(stepped);
         [&*low, &*drop].into_iter().for_each(|closed| stepped.remove(closed));
         released.clear();
         releases::find(reach, stepped, covered, free, |ix, iy| released.set(ix, iy));
         free.add(released);
+        let blocked = patches.find(reach, unproved, [free, low, drop]);
+        Findings { reach, blocked, low, drop, free }
     }
 }
 
@@ -146,8 +162,7 @@ impl LayerMaker for Freespace {
         let mut why = self.config.why.then(|| WHY.reuse(&mut layer.channels));
         match context.reach {
             Some(reach) => {
-                self.find(sweep, context, reach);
-                let findings = Findings { reach, low: &self.low, drop: &self.drop, free: &self.free };
+                let findings = self.find(sweep, context, reach);
                 findings.write_classes(&mut class);
                 height.iter_mut().for_each(|height| findings.write_heights(context, height));
                 why.iter_mut().for_each(|why| findings.write_reasons(&class, why));
