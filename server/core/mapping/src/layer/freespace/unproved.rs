@@ -40,14 +40,15 @@ impl Unproved {
         let confidences = ground.confidences();
         self.polar.fill(0);
         for column in 0..COLUMNS {
-            let mut behind_m = f32::INFINITY;
+            let mut behind_m: Option<f32> = None;
             let far = |(_, range_m): &(usize, &f32)| **range_m >= RANGE_M_MIN;
             for (row, range_m) in self.row_middles_m.iter().enumerate().rev().take_while(far) {
                 let cell = row * COLUMNS + column;
                 match confidences[cell] {
-                    Confidence::Seen => behind_m = *range_m,
+                    Confidence::Seen => behind_m = Some(*range_m),
                     Confidence::Bridged => {
-                        self.polar[cell] = u8::from(sensor_m * (1.0 - range_m / behind_m) > RAY_M_MAX);
+                        let ray_m = behind_m.map(|behind_m| sensor_m * (1.0 - range_m / behind_m));
+                        self.polar[cell] = u8::from(ray_m.is_some_and(|ray_m| ray_m > RAY_M_MAX));
                     }
                     Confidence::Extrapolated | Confidence::None => {}
                 }
