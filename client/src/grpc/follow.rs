@@ -5,50 +5,48 @@ use std::time::Duration;
 use bytes::Bytes;
 use clearway_proto::v1;
 use prost::Message;
+use tokio::sync::mpsc;
 
-use super::{Client, Watch, refused};
 use crate::error::ClientError;
 use crate::stream::{LatestSlot, Missed};
 use crate::view::MapView;
+
+use super::refusal::refused;
 
 /// Shortest and longest pause before a stream is opened again; each is twice the one before. Ours: a restart of a
 /// server costs a map, and a server that is away gets few requests.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
 
-/// Stores the maps of the stream in the slot, also when it is opened again, which it is only if it `reconnects`;
-/// returns why it ended.
-pub(super) async fn follow(
+/// The updates of an open stream, and the requests on it.
+pub(super) type Watch = (tonic::Streaming<v1::MapUpdate>, mpsc::Sender<v1::WatchRequest>);
+
+/// Stores the maps of the stream of this address in the slot, and those of the streams that `open_again` opens when one
+/// has ended; returns why the last one ended.
+pub(super) async fn follow<F: Future<Output = Result<Watch, ClientError>>>(
     slot: LatestSlot,
-    client: Client,
-    selection: v1::Selection,
+    address: String,
     opened: Watch,
-    reconnects: bool,
+    open_again: Option<impl Fn() -> F>,
 ) -> ClientError {
-    let (mut opened, mut base, mut pause) = (Some(opened), None, PAUSE.0);
+    let (mut watch, mut base) = (opened, None);
     loop {
-        let was_open = opened.is_some();
-        let ended = match opened.take() {
-            Some(watch) => receive_maps(&slot, &client.address, watch, &mut base).await,
-            None => match client.watch(&selection).await {
-                Ok(Ok(watch)) => {
-                    tracing::info!(address = client.address, "the stream of maps is open again");
-                    opened = Some(watch);
-                    continue;
-                }
-                Ok(Err(status)) => refused(&client.address, &status),
-                Err(unreachable) => unreachable,
-            },
+        let mut ended = receive_maps(&slot, &address, watch, &mut base).await;
+        let Some(open) = &open_again else { return ended };
+        tracing::warn!(reason = %ended, "the stream of maps has ended and is opened again");
+        let mut pause = PAUSE.0;
+        watch = loop {
+            if is_lasting(&ended) {
+                return ended;
+            }
+            slot.set_reasons(vec![ended.to_string()]);
+            tokio::time::sleep(pause).await;
+            pause = PAUSE.1.min(2 * pause);
+            match open().await {
+                Ok(watch) => break watch,
+                Err(error) => ended = error,
+            }
         };
-        if !reconnects || is_lasting(&ended) {
-            return ended;
-        }
-        if was_open {
-            tracing::warn!(reason = %ended, "the stream of maps has ended and is opened again");
-            pause = PAUSE.0;
-        }
-        slot.set_reasons(vec![ended.to_string()]);
-        tokio::time::sleep(pause).await;
-        pause = PAUSE.1.min(2 * pause);
+        tracing::info!(address, "the stream of maps is open again");
     }
 }
 

@@ -4,6 +4,9 @@
 //! connection with a small window and acknowledges every map, so a stalled reader delays no other reader and receives
 //! no old maps. A server that knows which other server serves a vehicle leads the client there.
 
+mod follow;
+mod refusal;
+
 use std::time::Duration;
 
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
@@ -23,7 +26,8 @@ use crate::ingest::{Ingester, ReportReceiver, SendObservation};
 use crate::stream::MapStream;
 use crate::view::MapView;
 
-mod follow;
+use follow::{Watch, follow};
+use refusal::{innermost, refused};
 
 /// Flow-control window of a stream, in bytes: one map with the default grids. More would queue old maps.
 const WINDOW_BYTES: u32 = 65_535;
@@ -40,9 +44,6 @@ pub struct Client {
     tls: Option<Tls>,
     service: MapServiceClient<Channel>,
 }
-
-/// The updates of an open stream, and the requests on it.
-type Watch = (tonic::Streaming<v1::MapUpdate>, mpsc::Sender<v1::WatchRequest>);
 
 /// Which maps to stream. The default is every layer of the server's only vehicle, with two maps in flight.
 #[derive(Clone, Debug, PartialEq)]
@@ -231,7 +232,12 @@ impl Client {
         }
         let opened = opened.map_err(|status| refused(&client.address, &status))?;
         let clock = Clock { is_of_replay: replay_clock, ..Clock::default() };
-        Ok(MapStream::spawn(clock, move |slot| follow::follow(slot, client, selection, opened, reconnects)))
+        let address = client.address.clone();
+        let open_again = reconnects.then_some(move || {
+            let (client, selection) = (client.clone(), selection.clone());
+            async move { client.watch(&selection).await?.map_err(|status| refused(&client.address, &status)) }
+        });
+        Ok(MapStream::spawn(clock, move |slot| follow(slot, address, opened, open_again)))
     }
 
     /// Opens a stream of maps on a connection of its own. The inner error is the server's answer.
@@ -322,24 +328,4 @@ fn with_zone_number(address: &str) -> String {
 async fn dial(endpoint: &Endpoint, address: &str) -> Result<Channel, ClientError> {
     let unreachable = |error| ClientError::Unreachable { address: address.into(), reason: innermost(&error) };
     endpoint.connect().await.map_err(unreachable)
-}
-
-fn refused(address: &str, status: &Status) -> ClientError {
-    if let Some(source) = std::error::Error::source(status) {
-        return ClientError::Unreachable { address: address.into(), reason: innermost(source) };
-    }
-    ClientError::Refused {
-        address: address.into(),
-        reason: status.message().into(),
-        code: format!("{:?}", status.code()),
-    }
-}
-
-/// Message of the innermost cause: the outer one is only "transport error".
-fn innermost(error: &dyn std::error::Error) -> String {
-    let mut error = error;
-    while let Some(source) = error.source() {
-        error = source;
-    }
-    error.to_string()
 }

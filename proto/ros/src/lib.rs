@@ -14,19 +14,13 @@
 //! | [`points`] | fields and bytes -> positions, intensities, rings and times, by the conventions of drivers |
 //! | `point_layout` | fields -> readers of the numbers of a point |
 //! | `point_times` | times as written -> unit, and ns after the header's stamp |
-//! | [`occupancy_grid`] | cells -> `nav_msgs/OccupancyGrid` |
-//! | [`markers`] | lines -> `visualization_msgs/MarkerArray` |
-//! | [`diagnostics`] | states of components -> `diagnostic_msgs/DiagnosticArray` |
 //! | [`pose`] | `Odometry`, `PoseStamped`, `TFMessage` -> poses; poses -> `Odometry`, `TFMessage`, `PoseArray` |
 //! | [`frames`] | transforms -> pose of one frame in another |
-//! | [`published`] | the published types: names, hashes, definitions |
+//! | [`published`] | the published types: names, hashes, definitions; grids, markers and states -> messages |
 
 pub mod cdr;
-pub mod diagnostics;
 pub mod frames;
 pub mod kind;
-pub mod markers;
-pub mod occupancy_grid;
 pub mod point_cloud2;
 mod point_layout;
 mod point_times;
@@ -38,6 +32,6 @@ pub mod velodyne_scan;
 pub use cdr::{MessageError, RefusedPart};
 pub use frames::Frames;
 pub use kind::Kind;
-pub use occupancy_grid::OccupancyGrid;
 pub use point_cloud2::PointCloud2;
 pub use points::Points;
+pub use published::occupancy_grid::OccupancyGrid;

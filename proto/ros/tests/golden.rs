@@ -1,11 +1,11 @@
 //! Messages written by rosbags are read correctly, and messages written here equal those of rosbags.
 
 use clearway_ros::cdr::Header;
-use clearway_ros::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
-use clearway_ros::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::pose::{
     Odometry, StampedTransform, Twist, pose_array_to_cdr, pose_stamped, tf_message, tf_message_to_cdr,
 };
+use clearway_ros::published::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
+use clearway_ros::published::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{PointCloud2, Points};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};

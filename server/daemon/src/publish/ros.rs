@@ -19,7 +19,7 @@ use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::ros::{self, LayerTopic, ShownLayer};
 use crate::encode::viewer::view;
 use clearway_ros::cdr::{Header, Writer};
-use clearway_ros::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
+use clearway_ros::published::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
 use clearway_ros::published::{BOOL, DIAGNOSTIC_ARRAY, Published, TF_MESSAGE};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};

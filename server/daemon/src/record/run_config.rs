@@ -57,7 +57,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
 }
 
 /// Keys of `[vehicle.maps]` that earlier versions had and that are constants now: table, key, value.
-const CONSTANTS: [(&str, &str, &str); 57] = [
+const CONSTANTS: [(&str, &str, &str); 59] = [
     ("height_difference", "range_m_max", "60"),
     ("height_difference", "columns", "360"),
     ("speed", "outside_corridor_mps", "0"),
@@ -85,6 +85,8 @@ const CONSTANTS: [(&str, &str, &str); 57] = [
     ("occupancy", "hold_maps", "2"),
     ("occupancy", "calm_maps", "5"),
     ("occupancy", "hits", "reduced"),
+    ("occupancy", "overhang_m", "5"),
+    ("occupancy", "range_m_max", "150"),
     ("drivability", "overhang_m", "2.5"),
     ("drivability", "unit_height_m", "0.25"),
     ("drivability", "offset_m", "0.125"),

@@ -7,9 +7,9 @@ use clearway_mapping::event::EgoPose;
 use clearway_proto::map::Layer;
 use clearway_ros::OccupancyGrid;
 use clearway_ros::cdr::Header;
-use clearway_ros::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
 use clearway_ros::pose::{Odometry, StampedTransform, Twist, pose_array_to_cdr, tf_message_to_cdr};
+use clearway_ros::published::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::published::{MARKER_ARRAY, OCCUPANCY_GRID, POINT_CLOUD2, POSE_ARRAY, Published};
 use nalgebra::Isometry3;
 

@@ -54,8 +54,10 @@ pub struct OccupancyConfig {
     pub clearance_m: f32,
     /// With `variant = "paper"`: least height of a return that is not counted, metres; the vehicle passes under it. 5:
     /// Seo 2014, section 2. The other variant has the overhang of [`crate::reach`].
+    #[serde(skip)]
     pub overhang_m: f32,
     /// Reliable range of the sensors, metres; cells beyond it are out of range. 150: Seo 2014, section 2.
+    #[serde(skip)]
     pub range_m_max: f32,
     /// Range to which a ray without a return clears cells, metres; 0: such rays prove nothing. 0 is ours, because a
     /// ray may also be lost on a dark or wet surface.
@@ -125,13 +127,12 @@ impl OccupancyConfig {
             ("extent_m", self.extent_m, (5.0..=100.0, "5 to 100")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
             ("clearance_m", self.clearance_m, (0.05..=2.0, "0.05 to 2")),
-            ("overhang_m", self.overhang_m, (0.5..=20.0, "0.5 to 20")),
-            ("range_m_max", self.range_m_max, (5.0..=300.0, "5 to 300")),
             ("no_return_m", self.no_return_m, (0.0..=300.0, "0 to 300")),
             // If no return were needed, a cell could be occupied without one.
         ];
         check_each(at, values)?;
-        check_fits(at, "overhang_m", self.overhang_m, self.overhang_m > self.clearance_m, "more than clearance_m")?;
+        let passes = self.overhang_m > self.clearance_m;
+        check_fits(at, "clearance_m", self.clearance_m, passes, "less than overhang_m of [vehicle.maps.reach]")?;
         check_cells(at, self.extent_m, self.cell_m)
     }
 }

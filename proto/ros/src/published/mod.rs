@@ -2,6 +2,16 @@
 //!
 //! Hashes are RIHS01 (REP-2016), equal from Iron to Jazzy. Definitions are those of `common_interfaces` and `geometry2`
 //! without comments, each followed by the definitions of its members (MCAP's `ros2msg`).
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`occupancy_grid`] | cells -> `nav_msgs/OccupancyGrid` |
+//! | [`markers`] | lines -> `visualization_msgs/MarkerArray` |
+//! | [`diagnostics`] | states of components -> `diagnostic_msgs/DiagnosticArray` |
+
+pub mod diagnostics;
+pub mod markers;
+pub mod occupancy_grid;
 
 /// A message type.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
