@@ -1,8 +1,8 @@
 //! Obstacles without gaps, and ground without patches, that are too small for any vehicle.
 //!
 //! In: closed and open cells, and the cells that are free, low or of drops. Out: the cells to call occupied, not
-//! reached and hidden. A gap of one or two cells between closed cells is occupied too, and ground of less than three
-//! cells by three, seen between obstacles by single returns, is hidden like all around it: a map is a quarter smaller by
+//! reached and hidden. A gap of one or two cells between closed cells is occupied too. Ground of less than three cells
+//! by three, seen between obstacles by single returns, is hidden like all around it: a map is a quarter smaller by
 //! it, and quieter to the eye. No free, low or dropping cell changes, nor does ground beside a free cell.
 
 use crate::reach::Reach;
