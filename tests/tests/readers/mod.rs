@@ -263,8 +263,9 @@ impl MapService for Lossy {
         let requests = request.into_inner().filter_map(|request| ready(request.ok()));
         let updates = plain(self.to).await.watch(requests).await?.into_inner();
         let lost = self.lost;
-        let kept =
-            updates.filter(move |update| ready(update.as_ref().map_or(true, |update| sequence(&update.map) != lost)));
+        // An update without a map has the state of a vehicle.
+        let is_kept = move |update: &v1::MapUpdate| update.map.is_empty() || sequence(&update.map) != lost;
+        let kept = updates.filter(move |update| ready(update.as_ref().map_or(true, is_kept)));
         Ok(Response::new(Box::pin(kept)))
     }
 
