@@ -25,6 +25,6 @@ class DecodeError(ClearwayError):
 
 
 def forked(what: str) -> ClearwayError:
-    """The error of a process that was forked from the one that opened `what`: its threads are there alone."""
+    """The error of a forked process that uses `what`: its threads are in the process alone that opened it."""
     text = f"{what} was opened before this process was forked, and works in the process that opened it alone: open it"
     return ClearwayError("fork", f"{text} after the fork, or start processes with multiprocessing.get_context('spawn')")

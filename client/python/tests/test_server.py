@@ -19,7 +19,7 @@ TRANSPORTS = [{"address": GRPC}, {"address": f"zenoh:{ZENOH}", "vehicle": "car"}
 @pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
 def test_the_newest_map_has_numpy_arrays(transport):
     with clearway.watch(**transport, layers=["drivability", "terrain"]) as maps:
-        # The first revolution of a sensor is partial, and so is one that lost packets on a busy machine.
+        # The first revolution of a sensor is partial; a busy machine loses packets of others.
         m = next(m for m in maps if m.header.sensors[0].state == "ok")
     assert list(m.layers) == ["drivability", "terrain"] and m.vehicle == "car"
     layer = m["drivability"]

@@ -20,8 +20,8 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_
 /// The updates of an open stream, and the requests on it.
 pub(super) type Watch = (tonic::Streaming<v1::MapUpdate>, mpsc::Sender<v1::WatchRequest>);
 
-/// Stores the maps of the stream of this address in the slot, and those of the streams that `open_again` opens when one
-/// has ended; returns why the last one ended.
+/// Stores the maps of an open stream in the slot, and after its end the maps of each stream that `open_again` opens;
+/// returns why the last stream ended.
 pub(super) async fn follow<F: Future<Output = Result<Watch, ClientError>>>(
     slot: LatestSlot,
     address: String,
@@ -64,7 +64,7 @@ fn is_lasting(ended: &ClientError) -> bool {
 
 /// Stores the map of every update in the slot and acknowledges it, in lockstep when it was handled; returns why the
 /// stream ended. If a delta needs a map that is not here (an update was lost), it requests a keyframe. Maps not stored
-/// count as skipped, except those that the requested rate excluded. `base` is the newest map.
+/// count as skipped, except maps that the requested rate excluded. `base` is the newest map.
 async fn receive_maps(
     slot: &LatestSlot,
     address: &str,

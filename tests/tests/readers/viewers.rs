@@ -163,7 +163,7 @@ async fn the_grid_of_a_sensor_that_stops_becomes_unknown_once_and_a_late_subscri
         let sample = within("a grid", subscriber.recv_async()).await.unwrap();
         let message = sample.payload().to_bytes();
         let stamp_ns = clearway_ros::cdr::Reader::new(&message).unwrap().header().unwrap().stamp_ns;
-        // Header, info and count end before the cells, of which the last are in a corner.
+        // Header, info and count end before the cells; the last cells are in a corner.
         let known = message[200..].iter().any(|&value| value != u8::MAX);
         (stamp_ns, known)
     };

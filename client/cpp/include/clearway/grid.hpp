@@ -47,7 +47,7 @@ struct RadialGrid {
     }
 };
 
-// Squares along axes of which the ego frame has the heading `yaw_rad`. Cell index = iy * width + ix.
+// Squares along axes; seen from them, the ego frame has the heading `yaw_rad`. Cell index = iy * width + ix.
 struct CartesianGrid {
     double origin_x_m = 0, origin_y_m = 0;
     std::uint32_t width = 0, height = 0;

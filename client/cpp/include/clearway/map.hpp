@@ -29,7 +29,7 @@ struct Channel {
     std::string name, unit;
     float scale = 0;
     CellType type = CellType::U8;
-    // Raw value of a cell of which nothing is known.
+    // Raw value of an unknown cell.
     std::int32_t unknown = 0;
     Cells cells;
 

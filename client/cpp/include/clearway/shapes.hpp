@@ -1,7 +1,7 @@
 // The shapes that questions are about: polygons of ground, outlines of vehicles, paths.
 //
 // In: values in the ego frame (x forward, y left, metres, radians). Out: checked corners and poses, or an `Error` with
-// the value that is not allowed. The reasons and the poses are equal to those of the Rust and the Python client.
+// the value that is not allowed. The Rust and the Python client have the same reasons and poses.
 #pragma once
 
 #include <array>

@@ -134,7 +134,7 @@ pub struct Ros2 {
     pub domain: u32,
     /// Prefix of the topics `/<vehicle>/<layer>`; may be empty.
     pub namespace: String,
-    /// True if the topics have the keys of zenoh-bridge-ros2dds, for ROS 2 over DDS, and not those of rmw_zenoh.
+    /// True if the topics have the keys of zenoh-bridge-ros2dds, for ROS 2 over DDS; else the keys of rmw_zenoh.
     pub dds_bridge: bool,
     /// True if the vehicles' poses are published on `/tf`: only if nothing else does.
     pub tf: bool,

@@ -10,7 +10,7 @@
 //!
 //! A message is made only while there is a subscriber; the first subscriber gets the newest map at once, later ones get
 //! it from the publisher's cache. When the newest map becomes stale, its grids are sent once more, unknown, so that no
-//! cache keeps one that looks fresh.
+//! cache keeps a grid that looks fresh.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;

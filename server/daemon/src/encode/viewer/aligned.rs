@@ -24,8 +24,8 @@ pub struct AlignedGrid {
 }
 
 impl AlignedGrid {
-    /// The smallest grid that holds the whole raster. `occupancies` are those of the raster's cells; of the pose of the
-    /// ego frame the position and the heading count.
+    /// The smallest grid that holds the whole raster. `occupancies` belong to the raster's cells. The position and
+    /// the heading of the ego frame's pose count alone.
     pub fn new(raster: &Raster, occupancies: &[i8], frame_from_ego: &Isometry3<f64>) -> Self {
         let forward = frame_from_ego * Vector3::x();
         let heading = Isometry3::new(frame_from_ego.translation.vector, Vector3::z() * forward.y.atan2(forward.x));

@@ -15,7 +15,7 @@ use super::raster::{Raster, meanings};
 /// Steps in which a ray passes a cell. Ours: it cuts at most a corner of the cells between two steps.
 const STEPS_PER_CELL: f64 = 2.0;
 
-/// The middles of the cells where something stands. The raster is that of the layer, which has squares.
+/// The middles of the cells where something stands. The raster belongs to the layer, which has squares.
 pub fn obstacles(layer: &Layer, raster: &Raster) -> Vec<[f32; 3]> {
     let stands = |meaning| matches!(meaning, ClassMeaning::Occupied | ClassMeaning::Low);
     let cells = (0..raster.width * raster.height).zip(meanings(layer)).filter(|(_, meaning)| stands(*meaning));
