@@ -115,9 +115,6 @@ pub(super) fn check(vehicles: &[Vehicle]) -> Result<(), ValueError> {
                 return wrong(key, &name, &format!("the vehicle's sensors: {}", known.join(", ")));
             }
         }
-        if !(65_536..=1 << 30).contains(&udp.receive_buffer_bytes) {
-            return wrong("receive_buffer_bytes", &udp.receive_buffer_bytes, "65536 to 1073741824 bytes");
-        }
         let joins = |group: &IpAddr| group.is_multicast() && (group.is_ipv4() || udp.data.is_ipv6());
         if let Some(group) = udp.groups.iter().find(|group| !joins(group)) {
             return wrong("groups", group, "multicast addresses, IPv6 groups only if data is an IPv6 address");

@@ -22,10 +22,8 @@ pub struct Ros {
     pub fixed_frame: String,
     /// The vehicle's own frame, with its origin on the ground, here and in what is published.
     pub ego_frame: String,
-    /// Topic of moving transforms; empty: no subscription.
+    /// Topic of moving transforms; empty: no subscription. Static ones are on the topic `<tf>_static`, as ROS 2 has it.
     pub tf: String,
-    /// Topic of static transforms; empty: no subscription.
-    pub tf_static: String,
     /// Topic of each sensor (PointCloud2 or VelodyneScan), by sensor name.
     pub sensors: BTreeMap<String, String>,
 }
@@ -38,7 +36,6 @@ impl Default for Ros {
             fixed_frame: "odom".into(),
             ego_frame: "base_link".into(),
             tf: "/tf".into(),
-            tf_static: "/tf_static".into(),
             sensors: BTreeMap::new(),
         }
     }
@@ -48,13 +45,13 @@ impl Ros {
     /// The frames without the topics: for events from files.
     pub(crate) fn frames_alone(self) -> Self {
         let Self { fixed_frame, ego_frame, .. } = self;
-        let (pose, tf, tf_static, sensors) = Default::default();
-        Self { domain: 0, pose, fixed_frame, ego_frame, tf, tf_static, sensors }
+        let (pose, tf, sensors) = Default::default();
+        Self { domain: 0, pose, fixed_frame, ego_frame, tf, sensors }
     }
 
     /// Checks the values; the keys of errors start behind `vehicle.`.
     pub(super) fn check(&self, zenoh_enabled: bool, sensors: &[SensorConfig]) -> Result<(), ValueError> {
-        let topics = self.sensors.values().chain([&self.pose, &self.tf, &self.tf_static]);
+        let topics = self.sensors.values().chain([&self.pose, &self.tf]);
         let mut named: Vec<_> = topics.filter(|topic| !topic.is_empty()).collect();
         if !zenoh_enabled && !named.is_empty() {
             let allowed = "only with zenoh.enabled = true, because ROS topics come through zenoh";

@@ -14,7 +14,8 @@ pub struct Udp {
     pub data: SocketAddr,
     /// Address and port of telemetry.
     pub telemetry: SocketAddr,
-    /// Receive buffer requested from the kernel for each socket, in bytes.
+    /// Receive buffer requested from the kernel for each socket, in bytes: 1 s of an HDL-64E. A constant but in tests.
+    #[serde(skip)]
     pub receive_buffer_bytes: usize,
     /// Multicast groups that the sockets join.
     pub groups: Vec<IpAddr>,

@@ -20,6 +20,10 @@ use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::base::sync::locked;
 use crate::config::Vehicle;
 
+/// Greatest time by which the stamp of an observation may be ahead of the server's clock, in ns. Ours: a sender whose
+/// clock is wrong by more needs a clock, and not maps.
+const AHEAD_NS_MAX: i64 = 10_000_000_000;
+
 /// The gateway of one vehicle.
 #[derive(Debug)]
 pub struct Gateway {
@@ -73,10 +77,7 @@ impl Gateway {
         let streams_max = vehicle.ingest.streams_max;
         Self {
             vehicle: vehicle.name.as_str().into(),
-            limits: Limits {
-                ahead_ns_max: i64::from(vehicle.ingest.ahead_ms_max) * 1_000_000,
-                ..Limits::from_points_max(vehicle.ingest.points_max)
-            },
+            limits: Limits { ahead_ns_max: AHEAD_NS_MAX, ..Limits::from_points_max(vehicle.ingest.points_max) },
             in_flight_max: (vehicle.ingest.events_max(vehicle.queue) / streams_max).max(1),
             sensors: Mutex::new(Sensors { config: vehicle.core(), clients: BTreeMap::new() }),
             streams: StreamLimits::new(streams_max, (streams_max / 4).max(1)),

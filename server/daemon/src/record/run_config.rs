@@ -57,9 +57,10 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
 }
 
 /// Keys of `[vehicle.maps]` that earlier versions had and that are constants now: table, key, value.
-const CONSTANTS: [(&str, &str, &str); 59] = [
+const CONSTANTS: [(&str, &str, &str); 67] = [
     ("height_difference", "range_m_max", "60"),
     ("height_difference", "columns", "360"),
+    ("height_difference", "difference_m_max", "0.25"),
     ("speed", "outside_corridor_mps", "0"),
     ("speed", "step_m_max", "0.2"),
     ("speed", "grade_max", "0.2"),
@@ -74,6 +75,9 @@ const CONSTANTS: [(&str, &str, &str); 59] = [
     ("speed", "route_ahead_m", "30"),
     ("speed", "curvature_per_m_max", "0.05"),
     ("speed", "overhang_m", "2.5"),
+    ("speed", "unknown_mps", "1"),
+    ("speed", "crawl_mps", "2"),
+    ("speed", "bonus_mps", "8"),
     ("speed", "corridor", "true"),
     ("speed", "speed_limits", "true"),
     ("occupancy", "clear_height_m_min", "0.2"),
@@ -87,6 +91,8 @@ const CONSTANTS: [(&str, &str, &str); 59] = [
     ("occupancy", "hits", "reduced"),
     ("occupancy", "overhang_m", "5"),
     ("occupancy", "range_m_max", "150"),
+    ("occupancy", "clearance_m", "0.3"),
+    ("occupancy", "no_return_m", "0"),
     ("drivability", "overhang_m", "2.5"),
     ("drivability", "unit_height_m", "0.25"),
     ("drivability", "offset_m", "0.125"),
@@ -98,6 +104,7 @@ const CONSTANTS: [(&str, &str, &str); 59] = [
     ("drivability", "grade_max", "0.2"),
     ("drivability", "plane_error_m_max", "0.25"),
     ("drivability", "plane_test", "each_side"),
+    ("drivability", "passage_m_min", "3"),
     ("drivability", "passage", "to_drivable_ground"),
     ("terrain", "overhang_m", "2.5"),
     ("terrain", "flatness_m2_max", "0.005"),
@@ -114,14 +121,19 @@ const CONSTANTS: [(&str, &str, &str); 59] = [
     ("memory", "range_m_max", "25"),
     ("memory", "ground_s_max", "5"),
     ("memory", "obstacle_s_max", "0.3"),
+    ("motion", "enabled", "true"),
     ("motion", "extrapolation_ms", "200"),
     ("motion", "speed_age_ms", "2000"),
     ("reach", "step_slope_min", "0.5"),
 ];
 
-/// Keys of other tables that earlier versions had. They changed no map.
-const REMOVED: [(&str, &str); 6] = [
+/// Keys of other tables that earlier versions had. They changed no map that is computed again.
+const REMOVED: [(&str, &str); 10] = [
     ("recorder", "queue"),
+    ("recorder", "warm_up_ms"),
+    ("connections", "kept"),
+    ("connections", "calls_max"),
+    ("connections", "calls_per_address_max"),
     ("recorder", "chunk_kb"),
     ("recorder", "compression"),
     ("traces", "one_in"),
@@ -129,27 +141,36 @@ const REMOVED: [(&str, &str); 6] = [
     ("connections", "stalled_s"),
 ];
 
+/// Keys of the tables of a vehicle that earlier versions had. They decided which events came, and change none.
+const REMOVED_OF_VEHICLE: [(&str, &str); 4] =
+    [("udp", "receive_buffer_bytes"), ("ros", "tf_static"), ("ingest", "streams_max"), ("ingest", "ahead_ms_max")];
+
 /// The text of a recorded configuration without the keys that this version does not have, and a sentence for each of
 /// them whose recorded value is not the constant of this version.
 fn without_removed_keys(text: &str) -> (String, Vec<String>) {
     let Ok(mut document) = text.parse::<toml::Table>() else { return (text.to_owned(), Vec::new()) };
     for (table, key) in REMOVED {
-        if let Some(table) = document.get_mut(table).and_then(toml::Value::as_table_mut) {
-            table.remove(key);
-        }
+        remove(document.get_mut(table), key);
     }
     let mut changed = Vec::new();
-    let vehicles = document.get_mut("vehicle").and_then(toml::Value::as_array_mut).into_iter().flatten();
-    for maps in vehicles.filter_map(|vehicle| vehicle.get_mut("maps")) {
+    for vehicle in document.get_mut("vehicle").and_then(toml::Value::as_array_mut).into_iter().flatten() {
+        for (table, key) in REMOVED_OF_VEHICLE {
+            remove(vehicle.get_mut(table), key);
+        }
+        let Some(maps) = vehicle.get_mut("maps") else { continue };
         for (table, key, constant) in CONSTANTS {
-            let keys = maps.get_mut(table).and_then(toml::Value::as_table_mut);
-            let Some(recorded) = keys.and_then(|keys| keys.remove(key)) else { continue };
+            let Some(recorded) = remove(maps.get_mut(table), key) else { continue };
             if !is_same_value(&recorded, constant) {
                 changed.push(format!("vehicle.maps.{table}.{key} = {recorded} is the constant {constant} now"));
             }
         }
     }
     (document.to_string(), changed)
+}
+
+/// Removes a key from a table that may not be there.
+fn remove(table: Option<&mut toml::Value>, key: &str) -> Option<toml::Value> {
+    table?.as_table_mut()?.remove(key)
 }
 
 /// True if a recorded value is a constant: numbers are compared as 32-bit ones, as the layers have them.
@@ -188,6 +209,7 @@ mod tests {
         speed.insert("smooth_m".into(), 0.03.into());
         speed.insert("rough_m".into(), 0.25.into());
         document["recorder"].as_table_mut().unwrap().insert("chunk_kb".into(), 16.into());
+        document["vehicle"][0]["ingest"].as_table_mut().unwrap().insert("streams_max".into(), 4.into());
         let (text, changed) = without_removed_keys(&document.to_string());
         assert_eq!(changed, ["vehicle.maps.speed.rough_m = 0.25 is the constant 0.15 now"]);
         Config::parse(&text, Path::new("config.toml"), &[]).unwrap();

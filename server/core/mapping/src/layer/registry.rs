@@ -43,7 +43,8 @@ macro_rules! layers {
         pub struct MapsConfig {
             /// Age after capture from which a map is stale, milliseconds. 300 is ours: three revolutions at 10 Hz.
             pub valid_ms: u32,
-            /// How the points of a scan are moved to its end.
+            /// How the points of a scan are moved to its end. The file has no key of it.
+            #[serde(skip_serializing)]
             pub motion: MotionConfig,
             /// Ground that is carried from map to map.
             pub memory: MemoryConfig,

@@ -90,9 +90,10 @@ pub async fn subscribe<'a>(
         let subscriber = subscriber.callback(move |sample| locked(&receiver).push(&topic, &sample));
         subscribed.topics.push(subscriber.await.map_err(ZenohError::of(format!("subscriber {key}")))?);
     }
-    if !ros.tf_static.is_empty() {
+    if !ros.tf.is_empty() {
         // Latched: the subscriber also requests the messages that were published before it came.
-        let (key, topic) = (key(ros.domain, &ros.tf_static), ros.tf_static.clone());
+        let topic = format!("{}_static", ros.tf);
+        let key = key(ros.domain, &topic);
         let subscriber = session.declare_subscriber(key.clone());
         let subscriber = subscriber.callback(move |sample| locked(&receiver).push(&topic, &sample));
         let subscriber = subscriber.history(HistoryConfig::default().detect_late_publishers());

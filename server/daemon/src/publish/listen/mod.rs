@@ -316,9 +316,7 @@ impl Shared {
         })?;
         let path = request.uri().path().to_owned();
         let call = slot.begin_call(Authorization { path, names, caller: caller.clone() }).ok_or_else(|| {
-            let text = "too many calls are in progress: connections.calls_max, of which connections.kept are for known \
-                        peers, and connections.calls_per_address_max limit those of all clients and those of";
-            full("calls", format!("{text} {}", slot.peer))
+            full("calls", format!("too many calls are in progress, of all clients or of {}", slot.peer))
         })?;
         Ok((caller, call))
     }

@@ -65,6 +65,7 @@ pub struct DrivabilityConfig {
     pub plane_test: PlaneTest,
     /// Least width of a contiguous boundary that the vehicle can drive across, metres (criterion 3). 3: thesis, section
     /// IV.5.
+    #[serde(skip)]
     pub passage_m_min: f32,
     /// The boundary that must be that wide. `to_drivable_ground` is ours, because noise frays the boundary between two
     /// segments; not tuned. The thesis has `between_segments`.
@@ -161,11 +162,7 @@ impl DrivabilityConfig {
     /// # Errors
     /// [`ConfigValueError`] for the first value that is not allowed.
     pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
-        let values = [
-            ("range_m_max", self.range_m_max, (5.0..=200.0, "5 to 200")),
-            ("passage_m_min", self.passage_m_min, (0.0..=20.0, "0 to 20")),
-        ];
-        check_each(at, values)?;
+        check_each(at, [("range_m_max", self.range_m_max, (5.0..=200.0, "5 to 200"))])?;
         check_columns(at, self.columns)
     }
 }

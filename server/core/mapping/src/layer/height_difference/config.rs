@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::value_check::{ConfigValueError, check_each};
+use crate::value_check::{ConfigValueError, check_columns};
 
 /// Parameters of the layer `height_difference`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -15,6 +15,7 @@ pub struct HeightDifferenceConfig {
     pub range_m_max: f32,
     /// Largest height difference between the points of a drivable cell, metres. 0.25 is ours, one unit of the layer
     /// `drivability`, because the thesis gives no value (section V); not tuned.
+    #[serde(skip)]
     pub difference_m_max: f32,
     /// Number of columns of the grid. 360 (one degree each): UT Austin thesis, section IV.1.
     #[serde(skip)]
@@ -33,6 +34,6 @@ impl HeightDifferenceConfig {
     /// # Errors
     /// [`ConfigValueError`] for the first value that is not allowed.
     pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
-        check_each(at, [("difference_m_max", self.difference_m_max, (0.01..=10.0, "0.01 to 10"))])
+        check_columns(at, self.columns)
     }
 }

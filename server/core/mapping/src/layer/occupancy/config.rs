@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::value_check::{ConfigValueError, check_cells, check_each, check_fits};
+use crate::value_check::{ConfigValueError, check_cells, check_each};
 
 /// Least height at which a ray proves a cell clear, metres: a lower ray could pass under a car. 0.2 is ours; not
 /// tuned.
@@ -51,6 +51,7 @@ pub struct OccupancyConfig {
     pub cell_m: f32,
     /// Least height of an obstacle over the ground, metres; the vehicle drives over lower ones. 0.3 is ours, because
     /// the paper says "ego-vehicle's clearance" without a number; not tuned.
+    #[serde(skip)]
     pub clearance_m: f32,
     /// With `variant = "paper"`: least height of a return that is not counted, metres; the vehicle passes under it. 5:
     /// Seo 2014, section 2. The other variant has the overhang of [`crate::reach`].
@@ -61,6 +62,7 @@ pub struct OccupancyConfig {
     pub range_m_max: f32,
     /// Range to which a ray without a return clears cells, metres; 0: such rays prove nothing. 0 is ours, because a
     /// ray may also be lost on a dark or wet surface.
+    #[serde(skip)]
     pub no_return_m: f32,
     /// What the channel `hits` contains. `reduced` is ours, because it costs fewer bytes (BENCHMARKS.md has the sizes);
     /// `counted` is the paper's (section 2).
@@ -123,16 +125,9 @@ impl OccupancyConfig {
     /// # Errors
     /// [`ConfigValueError`] for the first value that is not allowed.
     pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
-        let values = [
-            ("extent_m", self.extent_m, (5.0..=100.0, "5 to 100")),
-            ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
-            ("clearance_m", self.clearance_m, (0.05..=2.0, "0.05 to 2")),
-            ("no_return_m", self.no_return_m, (0.0..=300.0, "0 to 300")),
-            // If no return were needed, a cell could be occupied without one.
-        ];
+        let values =
+            [("extent_m", self.extent_m, (5.0..=100.0, "5 to 100")), ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2"))];
         check_each(at, values)?;
-        let passes = self.overhang_m > self.clearance_m;
-        check_fits(at, "clearance_m", self.clearance_m, passes, "less than overhang_m of [vehicle.maps.reach]")?;
         check_cells(at, self.extent_m, self.cell_m)
     }
 }

@@ -54,7 +54,9 @@ pub(super) const SPEED_AGE_MS: u32 = 2000;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MotionConfig {
-    /// True if points are moved to the end of their scan. The pose in a map's header is interpolated in any case.
+    /// True if points are moved to the end of their scan: a constant but in tests. The pose in a map's header is
+    /// interpolated in any case.
+    #[serde(skip)]
     pub enabled: bool,
 }
 
