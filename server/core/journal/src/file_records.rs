@@ -22,8 +22,8 @@ pub(super) enum FileRecords {
 }
 
 impl FileRecords {
-    /// Opens a file. With `any_start`, wrong first bytes are damage and not an error.
-    pub(super) fn open(path: &Path, any_start: bool) -> Result<Self, RecordsError> {
+    /// Opens a file.
+    pub(super) fn open(path: &Path) -> Result<Self, RecordsError> {
         let mut file = open_to_read(path)?;
         let metadata = file.metadata()?;
         if metadata.is_file() && metadata.len() == 0 {
@@ -36,12 +36,12 @@ impl FileRecords {
                 return Ok(bag(path)?);
             }
         }
-        Self::of_mcap(file, any_start)
+        Self::of_mcap(file)
     }
 
     /// The records of an MCAP file.
-    pub(super) fn of_mcap(source: impl McapSource + 'static, any_start: bool) -> Result<Self, RecordsError> {
-        Ok(Self::Mcap(Box::new(McapRecords::open(Box::new(source), any_start)?)))
+    pub(super) fn of_mcap(source: impl McapSource + 'static) -> Result<Self, RecordsError> {
+        Ok(Self::Mcap(Box::new(McapRecords::open(Box::new(source))?)))
     }
 
     /// Number of bytes read so far.

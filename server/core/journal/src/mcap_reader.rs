@@ -101,15 +101,8 @@ pub enum McapReadError {
         source: std::io::Error,
     },
     /// The file does not start as an MCAP file does.
-    #[error("{}: not an MCAP file: it does not start with the magic bytes; if it was one, `clearway repair` reads the rest",
-        file.display())]
+    #[error("{}: not an MCAP file: it does not start with the magic bytes", file.display())]
     NotMcap {
-        /// The file.
-        file: PathBuf,
-    },
-    /// The file was searched for records of an MCAP file, and has none.
-    #[error("{}: not an MCAP file, and no record of one is in it", file.display())]
-    NoRecord {
         /// The file.
         file: PathBuf,
     },
@@ -157,7 +150,7 @@ impl McapReader {
     /// [`McapReadError::Read`] if the file cannot be read, [`McapReadError::NotMcap`] if it is not an MCAP file,
     /// [`McapReadError::Version`] if a later version of clearway wrote it.
     pub fn open(file: &Path) -> Result<Self, McapReadError> {
-        Self::unread(file, FileRecords::open(file, false))?.with_first()
+        Self::unread(file, FileRecords::open(file))?.with_first()
     }
 
     /// Reads an MCAP file from `source`, up to its first message; errors name it `file`.
@@ -165,12 +158,12 @@ impl McapReader {
     /// # Errors
     /// As [`McapReader::open`].
     pub fn from_source(file: &Path, source: impl McapSource + 'static) -> Result<Self, McapReadError> {
-        Self::unread(file, FileRecords::of_mcap(source, false))?.with_first()
+        Self::unread(file, FileRecords::of_mcap(source))?.with_first()
     }
 
-    /// Opens a file to read its records; its first bytes may be damaged too.
-    pub(super) fn open_any(file: &Path) -> Result<Self, McapReadError> {
-        Self::unread(file, FileRecords::open(file, true))
+    /// Opens a file to read its records.
+    pub(super) fn open_records(file: &Path) -> Result<Self, McapReadError> {
+        Self::unread(file, FileRecords::open(file))
     }
 
     fn with_first(mut self) -> Result<Self, McapReadError> {
@@ -453,6 +446,5 @@ fn read_error(file: &Path, error: RecordsError) -> McapReadError {
     match error {
         RecordsError::Read(source) => McapReadError::Read { source: advised(&file, source), file },
         RecordsError::NotMcap => McapReadError::NotMcap { file },
-        RecordsError::NoRecord => McapReadError::NoRecord { file },
     }
 }

@@ -17,8 +17,6 @@ use super::chunk::{
 use super::damage::LostPart;
 use super::mcap_summary::McapSummary;
 
-/// Why a file that is repaired does not start as MCAP files do.
-const NO_MAGIC: &str = "the file does not start with the magic bytes";
 /// Least kind of the records that programs define for themselves.
 const PRIVATE: u8 = 0x80;
 
@@ -28,8 +26,6 @@ pub(super) enum RecordsError {
     Read(io::Error),
     /// The file does not start as an MCAP file does.
     NotMcap,
-    /// The file has neither the start of an MCAP file nor a record that its summary names.
-    NoRecord,
 }
 
 impl From<io::Error> for RecordsError {
@@ -101,11 +97,11 @@ pub(super) struct McapRecords {
 }
 
 impl McapRecords {
-    /// Reads from `source`. With `any_start`, wrong first bytes are damage and not an error.
+    /// Reads from `source`.
     ///
     /// # Errors
     /// [`RecordsError`] if it cannot be read, or is no MCAP file.
-    pub(super) fn open(mut source: Box<dyn McapSource>, any_start: bool) -> Result<Self, RecordsError> {
+    pub(super) fn open(mut source: Box<dyn McapSource>) -> Result<Self, RecordsError> {
         let summary = McapSummary::read(&mut source)?;
         let length = source.seek(SeekFrom::End(0))?;
         let mut records = Self {
@@ -124,20 +120,10 @@ impl McapRecords {
             lost: Vec::new(),
         };
         let start = records.read_at(0, MAGIC.len() as u64)?;
-        records.crc.update(&start);
         if start != MAGIC {
-            if !any_start {
-                return Err(RecordsError::NotMcap);
-            }
-            if matches!(records.head_at(records.offset)?, Some((op::HEADER, _))) {
-                records.lost.push(LostPart::new((0, records.offset), NO_MAGIC.into(), false));
-            } else {
-                records.skip(0, 0, None, NO_MAGIC)?;
-            }
-            if records.section == Section::Ended {
-                return Err(RecordsError::NoRecord);
-            }
+            return Err(RecordsError::NotMcap);
         }
+        records.crc.update(&start);
         Ok(records)
     }
 

@@ -96,7 +96,7 @@ pub fn repair(input: &Path, output: &Path) -> Result<Report, RepairError> {
     if output.exists() {
         return Err(create(std::io::ErrorKind::AlreadyExists.into()));
     }
-    let mut reader = McapReader::open_any(input)?;
+    let mut reader = McapReader::open_records(input)?;
     let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let name = output.file_name().unwrap_or_default().to_string_lossy();
     let partial = folder.join(format!(".{name}.{}.partial", std::process::id()));
