@@ -45,7 +45,7 @@ const COLUMNS: [u16; 6] = [8, 90, 180, 360, 720, 1440];
 type Drive = Rc<[Vec<Event>]>;
 
 #[derive(Parser)]
-struct Arguments {
+struct CostsArguments {
     /// What the cost is measured against.
     #[arg(value_enum, default_values_t = [Quantity::Lasers, Quantity::Cells])]
     quantities: Vec<Quantity>,
@@ -64,7 +64,7 @@ enum Quantity {
 }
 
 fn main() {
-    let arguments = Arguments::parse();
+    let arguments = CostsArguments::parse();
     let revolutions = WARM_UP + arguments.rounds;
     println!("quantity,setting,lasers,series,round,cells,points,map_ms,encode_ms,bytes");
     for quantity in arguments.quantities {

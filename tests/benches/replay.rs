@@ -34,7 +34,7 @@ const SETTLE: Duration = Duration::from_secs(3);
 
 /// Measures the age of the maps of a replay as live when its readers have them.
 #[derive(Parser)]
-struct Arguments {
+struct ReplayBenchArguments {
     /// A recording of one vehicle.
     #[arg(long)]
     drive: Option<PathBuf>,
@@ -53,7 +53,7 @@ struct Arguments {
 type Ages = Arc<Mutex<Vec<f64>>>;
 
 fn main() {
-    let arguments = Arguments::parse();
+    let arguments = ReplayBenchArguments::parse();
     let folder = tempfile::tempdir().expect("a folder");
     let drive = arguments.drive.unwrap_or_else(|| simulated(arguments.seconds, folder.path()));
     let (config, vehicle) = with_ros_2(&drive, folder.path());

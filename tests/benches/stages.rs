@@ -55,7 +55,7 @@ const SIDE: usize = 400;
 const CELL_M: f32 = 0.25;
 
 #[derive(Parser)]
-struct Arguments {
+struct StagesArguments {
     /// A scan in KITTI's format: float32 x y z intensity.
     scan: Option<PathBuf>,
     /// Height of its sensor over the ground, metres.
@@ -74,7 +74,7 @@ struct Arguments {
 }
 
 fn main() {
-    let arguments = Arguments::parse();
+    let arguments = StagesArguments::parse();
     let mut stages = Stages::new(&arguments);
     if arguments.ask {
         println!("{}", Stages::NAMES.join(" "));
@@ -148,7 +148,7 @@ impl Stages {
         "encode",
     ];
 
-    fn new(arguments: &Arguments) -> Self {
+    fn new(arguments: &StagesArguments) -> Self {
         let vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
         let start_ns = vehicle.start_ns();
         let data = vehicle.clone().filter(|datagram| datagram.kind == Kind::Data);

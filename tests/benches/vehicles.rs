@@ -39,7 +39,7 @@ const SENDERS: usize = 2;
 const LAYERS: [&str; 2] = ["drivability", "speed"];
 
 #[derive(Parser)]
-struct Arguments {
+struct VehiclesBenchArguments {
     /// How many vehicles, one row each.
     #[arg(long, value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
     vehicles: Vec<usize>,
@@ -61,7 +61,7 @@ struct Arguments {
 }
 
 fn main() {
-    let arguments = Arguments::parse();
+    let arguments = VehiclesBenchArguments::parse();
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.expect("a runtime");
     if let Some(vehicles) = arguments.serve {
@@ -110,7 +110,7 @@ fn print_row(row: &Value) {
 }
 
 /// Runs one row.
-async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>) -> Value {
+async fn measure(vehicles: usize, arguments: &VehiclesBenchArguments, drive: &Arc<[Datagram]>) -> Value {
     let mut server = Process::start(vehicles, &arguments.cpus);
     let client = Client::connect(&server.grpc).await.expect("the server answers");
     let empty_kib = server.resident_kib();

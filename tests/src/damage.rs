@@ -31,7 +31,7 @@ pub struct Original {
 
 /// What was read of a damaged copy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Outcome {
+pub struct DamageOutcome {
     /// True if the file was refused as a whole, by name.
     pub refused: bool,
     /// Number of messages that were not read.
@@ -95,10 +95,10 @@ impl Original {
     ///
     /// # Errors
     /// If the cut is not named, or a message of a whole chunk before it is lost, or one is read that was not recorded.
-    pub fn cut(&self, length: usize) -> Result<Outcome, String> {
+    pub fn cut(&self, length: usize) -> Result<DamageOutcome, String> {
         let read = match reader(self.bytes.clone(), length) {
             Ok(read) => read,
-            Err(_) if length < MAGIC.len() => return Ok(Outcome { refused: true, ..Outcome::default() }),
+            Err(_) if length < MAGIC.len() => return Ok(DamageOutcome { refused: true, ..DamageOutcome::default() }),
             Err(error) => return Err(error),
         };
         let (messages, incomplete) = messages_of(read)?;
@@ -107,19 +107,19 @@ impl Original {
         if messages != expected {
             return Err(format!("{} messages are read, and {} are before the cut", messages.len(), expected.len()));
         }
-        Ok(Outcome { lost: (self.messages.len() - messages.len()) as u64, ..Outcome::default() })
+        Ok(DamageOutcome { lost: (self.messages.len() - messages.len()) as u64, ..DamageOutcome::default() })
     }
 
     /// Writes the first `length` bytes to a file in `folder`, repairs it, and verifies the repaired file.
     ///
     /// # Errors
     /// As [`Original::cut`], of the repaired file; and if it is not whole or a map in it differs.
-    pub fn repair_cut(&self, length: usize, folder: &Path) -> Result<Outcome, String> {
+    pub fn repair_cut(&self, length: usize, folder: &Path) -> Result<DamageOutcome, String> {
         let file = folder.join("cut.mcap");
         std::fs::write(&file, &self.bytes[..length]).map_err(|error| error.to_string())?;
         let Some(messages) = repaired(&file)? else {
             return match self.before(length) {
-                [] => Ok(Outcome { refused: true, ..Outcome::default() }),
+                [] => Ok(DamageOutcome { refused: true, ..DamageOutcome::default() }),
                 lost => Err(format!("{} messages are before the cut, and nothing is repaired", lost.len())),
             };
         };
@@ -127,7 +127,7 @@ impl Original {
             return Err(format!("{} messages are repaired, and not those before the cut", messages.len()));
         }
         let lost = (self.messages.len() - messages.len()) as u64;
-        Ok(Outcome { lost, repaired: true, ..Outcome::default() })
+        Ok(DamageOutcome { lost, repaired: true, ..DamageOutcome::default() })
     }
 
     /// Writes the first `length` bytes to a file in `folder`, and runs `info`, `verify` and `repair` of the program
@@ -135,7 +135,7 @@ impl Original {
     ///
     /// # Errors
     /// If a command ends with another exit code than it should, does not name the file, or panics.
-    pub fn cut_by_program(&self, length: usize, clearway: &Path, folder: &Path) -> Result<Outcome, String> {
+    pub fn cut_by_program(&self, length: usize, clearway: &Path, folder: &Path) -> Result<DamageOutcome, String> {
         let (file, repaired) = (folder.join("cut.mcap"), folder.join("repaired.mcap"));
         std::fs::write(&file, &self.bytes[..length]).map_err(|error| error.to_string())?;
         let run = |command: &str, files: &[&Path], expected: i32| {
@@ -161,7 +161,7 @@ impl Original {
             run("verify", &[&repaired], 0)?;
             std::fs::remove_file(&repaired).map_err(|error| error.to_string())?;
         }
-        Ok(Outcome { lost: (self.messages.len() - kept) as u64, repaired: kept > 0, ..Outcome::default() })
+        Ok(DamageOutcome { lost: (self.messages.len() - kept) as u64, repaired: kept > 0, ..DamageOutcome::default() })
     }
 
     /// Copies the recording to `file`.
@@ -185,7 +185,7 @@ impl Copy {
     /// # Errors
     /// If the change is not named, or costs more than the chunk that it is in, or a message is read that was not
     /// recorded.
-    pub fn flip(&self, original: &Original, at: usize, bit: u8) -> Result<Outcome, String> {
+    pub fn flip(&self, original: &Original, at: usize, bit: u8) -> Result<DamageOutcome, String> {
         let byte = original.bytes[at];
         self.write(at, byte ^ (1 << bit))?;
         let outcome = self.read(original);
@@ -198,14 +198,14 @@ impl Copy {
         file.seek(SeekFrom::Start(at as u64)).and_then(|_| file.write_all(&[byte])).map_err(|error| error.to_string())
     }
 
-    fn read(&self, original: &Original) -> Result<Outcome, String> {
+    fn read(&self, original: &Original) -> Result<DamageOutcome, String> {
         let name = self.file.display().to_string();
         let mut reader = match McapReader::open(&self.file) {
             Ok(reader) => reader,
             // Its first bytes, or the version in its metadata, are changed.
             Err(error @ (McapReadError::NotMcap { .. } | McapReadError::Version { .. })) => {
                 let is_named = error.to_string().contains(&name);
-                let refused = Outcome { refused: true, ..Outcome::default() };
+                let refused = DamageOutcome { refused: true, ..DamageOutcome::default() };
                 return if is_named { Ok(refused) } else { Err(format!("{error} does not name {name}")) };
             }
             Err(error) => return Err(error.to_string()),
@@ -230,7 +230,7 @@ impl Copy {
             Some(kept) if kept != messages => return Err("the repaired file has other messages".into()),
             kept => kept.is_some(),
         };
-        Ok(Outcome { refused: false, lost: lost as u64, named, repaired: is_repaired })
+        Ok(DamageOutcome { refused: false, lost: lost as u64, named, repaired: is_repaired })
     }
 }
 

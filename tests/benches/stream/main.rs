@@ -46,7 +46,7 @@ const BEFORE_S: u64 = 30;
 const SETTLE: Duration = Duration::from_secs(3);
 
 #[derive(Parser)]
-struct Arguments {
+struct StreamArguments {
     /// How many readers, one row each.
     #[arg(long, value_delimiter = ',', default_values_t = [1, 10, 100, 1000])]
     readers: Vec<usize>,
@@ -105,7 +105,7 @@ struct Readers {
 }
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = StreamArguments::parse();
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().expect("a runtime");
     if arguments.serve {
         runtime.block_on(serve());
@@ -179,7 +179,7 @@ fn print_row(row: &serde_json::Value) {
 
 /// Measures one row: a new server, and this many readers.
 async fn measure(
-    arguments: &Arguments,
+    arguments: &StreamArguments,
     revolutions: &Revolutions,
     carrier: Carrier,
     count: usize,

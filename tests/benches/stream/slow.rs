@@ -23,7 +23,7 @@ use tonic::transport::Endpoint;
 
 use crate::drive::{Car, Revolutions};
 use crate::server::Process;
-use crate::{Arguments, Carrier, Readers, SETTLE, percentiles};
+use crate::{Carrier, Readers, SETTLE, StreamArguments, percentiles};
 
 const HEALTHY: usize = 8;
 const BYTES_A_SECOND: u64 = 10_000;
@@ -33,7 +33,7 @@ const IN_FLIGHT: u32 = 2;
 const ROUNDS: usize = 2;
 
 /// Measures and prints; returns the rows.
-pub async fn measure(arguments: &Arguments, revolutions: &Revolutions) -> Vec<Value> {
+pub async fn measure(arguments: &StreamArguments, revolutions: &Revolutions) -> Vec<Value> {
     let mut rows = Vec::new();
     if !arguments.json {
         println!(
@@ -56,7 +56,7 @@ pub async fn measure(arguments: &Arguments, revolutions: &Revolutions) -> Vec<Va
 }
 
 /// Measures one part with a new server.
-async fn part(arguments: &Arguments, revolutions: &Revolutions, with: bool) -> Value {
+async fn part(arguments: &StreamArguments, revolutions: &Revolutions, with: bool) -> Value {
     let mut server = Process::start();
     let readers = Readers::default();
     let car = Car::drive(revolutions, server.data, &readers.cuts);

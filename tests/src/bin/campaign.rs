@@ -14,7 +14,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 /// Simulates the whole system on a clock of its own, with faults drawn from seeds.
 #[derive(Parser)]
-struct Arguments {
+struct CampaignArguments {
     /// Number of seeds.
     #[arg(long, default_value_t = 10_000)]
     seeds: u64,
@@ -33,7 +33,7 @@ struct Arguments {
 const SEEDS_A_LINE: u64 = 500;
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = CampaignArguments::parse();
     let (first, end) = match arguments.seed {
         Some(seed) => (seed, seed + 1),
         None => (arguments.from, arguments.from + arguments.seeds),

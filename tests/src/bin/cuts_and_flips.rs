@@ -13,12 +13,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use clap::Parser;
-use clearway_tests::damage::{Original, Outcome, rechunk};
+use clearway_tests::damage::{DamageOutcome, Original, rechunk};
 use tempfile::TempDir;
 
 /// Cuts a recording at many bytes and changes many of its bits.
 #[derive(Parser)]
-struct Arguments {
+struct CutsArguments {
     /// The recording.
     file: PathBuf,
     /// Cut at every so many bytes.
@@ -51,7 +51,7 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = CutsArguments::parse();
     let bytes = std::fs::read(&arguments.file).expect("the recording can be read");
     let bytes = match arguments.chunk_bytes {
         Some(chunk_bytes) => rechunk(&bytes, chunk_bytes).expect("the recording is whole"),
@@ -102,7 +102,7 @@ fn main() -> ExitCode {
 }
 
 /// Judges `count` copies on several threads and prints the counts; `start` makes the judge of a thread.
-fn judge<J: FnMut(usize) -> Result<Outcome, String>>(
+fn judge<J: FnMut(usize) -> Result<DamageOutcome, String>>(
     what: &str,
     count: usize,
     threads: usize,

@@ -23,12 +23,12 @@ use clearway_sim::send::{Pace, Until, drive};
 use clearway_sim::vehicle::SimulatedVehicle;
 use clearway_tests::siege::attacks;
 use clearway_tests::siege::target::{Attack, Target};
-use clearway_tests::siege::watch::{Reader, Seen, Sender, newcomer, processor_s, resident_mib};
+use clearway_tests::siege::watch::{Seen, Sender, SiegeReader, newcomer, processor_s, resident_mib};
 use tokio::runtime::Handle;
 
 /// Every attack against one server, with healthy readers beside it.
 #[derive(Parser)]
-struct Arguments {
+struct SiegeArguments {
     /// Time for all attacks together, in minutes.
     #[arg(long, default_value_t = 10.0)]
     minutes: f64,
@@ -46,7 +46,7 @@ const RECOVERY: Duration = Duration::from_secs(5);
 const SAMPLE: Duration = Duration::from_millis(100);
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = SiegeArguments::parse();
     let server = arguments.server.clone().unwrap_or_else(build);
     let chosen: Vec<_> = attacks().into_iter().filter(|attack| attack.name.contains(&arguments.only)).collect();
     if chosen.is_empty() {
@@ -128,14 +128,14 @@ fn start(server: &PathBuf, config: PathBuf, target: &Target) -> Child {
 /// The peers beside the attacks.
 struct Healthy {
     /// Over gRPC and over zenoh.
-    readers: [Reader; 2],
+    readers: [SiegeReader; 2],
     sender: Sender,
 }
 
 impl Healthy {
     /// What the readers have seen and the sender has lost since the last call.
     fn take(&self) -> ([Seen; 2], u64) {
-        (self.readers.each_ref().map(Reader::take), self.sender.take())
+        (self.readers.each_ref().map(SiegeReader::take), self.sender.take())
     }
 }
 
@@ -160,8 +160,10 @@ async fn besiege(
     while newcomer(target).await.is_none() {
         assert!(began.elapsed() < Duration::from_secs(60), "the server does not start");
     }
-    let healthy =
-        Healthy { readers: [Reader::start(target, false), Reader::start(target, true)], sender: Sender::start(target) };
+    let healthy = Healthy {
+        readers: [SiegeReader::start(target, false), SiegeReader::start(target, true)],
+        sender: Sender::start(target),
+    };
     tokio::time::sleep(RECOVERY).await;
     println!(
         "| attack | gRPC p99 ms | worst ms | missed | broken | zenoh p99 ms | worst ms | missed | broken | passed over \
@@ -178,7 +180,7 @@ async fn besiege(
             break;
         }
     }
-    healthy.readers.into_iter().for_each(Reader::stop);
+    healthy.readers.into_iter().for_each(SiegeReader::stop);
     healthy.sender.stop();
     halt.store(true, Ordering::Relaxed);
     let _sent = sensor.join();

@@ -16,7 +16,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// Time between two scans of the sender.
 const SCAN_PERIOD: Duration = Duration::from_millis(100);
 
-/// What one reader has seen since the last [`Reader::take`].
+/// What one reader has seen since the last [`SiegeReader::take`].
 #[derive(Clone, Debug, Default)]
 pub struct Seen {
     /// Age of each map on arrival, in ms.
@@ -39,13 +39,13 @@ impl Seen {
 }
 
 /// A reader in a thread and a runtime of its own, so that the attackers' tasks do not delay it.
-pub struct Reader {
+pub struct SiegeReader {
     seen: Arc<Mutex<Seen>>,
     stop: Arc<AtomicBool>,
     thread: JoinHandle<()>,
 }
 
-impl Reader {
+impl SiegeReader {
     /// Starts a reader over gRPC, or over zenoh.
     pub fn start(target: &Target, over_zenoh: bool) -> Self {
         let (seen, stop, target) = (Arc::<Mutex<Seen>>::default(), Arc::<AtomicBool>::default(), target.clone());

@@ -41,7 +41,7 @@ pub enum Habit {
 }
 
 /// One reader.
-pub struct Reader {
+pub struct SimulatedReader {
     habit: Habit,
     layers: Vec<String>,
     max_in_flight: usize,
@@ -57,7 +57,7 @@ pub struct Reader {
 }
 
 /// One reader of each kind.
-pub fn readers(rng: &mut Rng, layers: &[&'static str]) -> Vec<Reader> {
+pub fn readers(rng: &mut Rng, layers: &[&'static str]) -> Vec<SimulatedReader> {
     let from_ns = rng.within(REVOLUTION_NS..HEAL_NS);
     let habits = [
         (Habit::Fast, 2),
@@ -72,12 +72,23 @@ pub fn readers(rng: &mut Rng, layers: &[&'static str]) -> Vec<Reader> {
         let rng = Rng::new(rng.draw());
         let (open, last, in_flight) = (None, None, VecDeque::new());
         let (next_poll_ns, updates, skipped) = (0, 0, 0);
-        Reader { habit, layers: chosen, max_in_flight, rng, next_poll_ns, open, last, in_flight, updates, skipped }
+        SimulatedReader {
+            habit,
+            layers: chosen,
+            max_in_flight,
+            rng,
+            next_poll_ns,
+            open,
+            last,
+            in_flight,
+            updates,
+            skipped,
+        }
     };
     habits.into_iter().map(reader).collect()
 }
 
-impl Reader {
+impl SimulatedReader {
     /// True if the reader has an open stream.
     pub fn is_open(&self) -> bool {
         self.open.is_some()

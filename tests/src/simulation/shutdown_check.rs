@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 
 use super::checks::{Violation, accounts, adds_up, describe, violation};
 use super::fault_plan::{HEAL_NS, InjectedFault, REVOLUTION_NS};
-use super::readers::Reader;
+use super::readers::SimulatedReader;
 use super::recording_check::Recorded;
 use super::test_bed::TestBed;
 
@@ -78,7 +78,7 @@ impl TestBed<'_> {
         for map in &self.maps {
             hasher.write(&map.select(&[]));
         }
-        let sum = |of: &dyn Fn(&Reader) -> u64| self.readers.iter().map(of).sum();
+        let sum = |of: &dyn Fn(&SimulatedReader) -> u64| self.readers.iter().map(of).sum();
         let outcome = Outcome {
             simulated_ns: self.now_ns,
             events: self.taken,

@@ -30,7 +30,7 @@ use super::drive::{Drive, drives};
 use super::fault_plan::{
     DiskFault, END_NS, FLUSH_MS, FaultPlan, HEAL_NS, InjectedFault, REVOLUTION_NS, Rng, TICK_NS, WARM_UP_MS,
 };
-use super::readers::{Reader, readers};
+use super::readers::{SimulatedReader, readers};
 use super::recording_check::{MemoryDisk, Recorded};
 
 /// Revolutions with a covered window until maps must show it: the one in which it was covered, another, and those in
@@ -73,7 +73,7 @@ pub(super) struct TestBed<'a> {
     pub(super) outcome_sender: OutcomeSender,
     pub(super) outcomes: UnboundedReceiver<(ObservationId, EventOutcome)>,
 
-    pub(super) readers: Vec<Reader>,
+    pub(super) readers: Vec<SimulatedReader>,
 
     pub(super) began: Instant,
     pub(super) disk: MemoryDisk,

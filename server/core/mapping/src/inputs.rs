@@ -1,6 +1,6 @@
 //! All that events change: the sensors with their newest scans, the motion of the vehicle, and the roads.
 //!
-//! In: one [`Event`] after the other. Out: an [`Outcome`] each, and the inputs of fusion and layers.
+//! In: one [`Event`] after the other. Out: an [`InputOutcome`] each, and the inputs of fusion and layers.
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
@@ -30,7 +30,7 @@ const QUATERNION_NORM: std::ops::RangeInclusive<f64> = 1.0 - 1e-6..=1.0 + 1e-6;
 
 /// What an accepted event changed, as far as the ledgers count it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Outcome {
+pub(crate) struct InputOutcome {
     /// Points that were removed from the scan that the event completed; `None` if the event completed no scan.
     pub completed_scan: Option<RemovedPoints>,
     /// Packets of the sensor that were counted as decoded while the decoder held them back, and that do not fit the
@@ -80,24 +80,24 @@ impl Inputs {
     ///
     /// # Errors
     /// [`EventError`] if the event is refused; then nothing has changed but what its stamp shows of its clock.
-    pub fn apply(&mut self, event: &Event, now: EventTime) -> Result<Outcome, EventError> {
+    pub fn apply(&mut self, event: &Event, now: EventTime) -> Result<InputOutcome, EventError> {
         let outcome = match &event.body {
             Body::Datagram(payload) => self.apply_datagram(event.source, payload, now)?,
             Body::Scan(scan) => {
                 let (sensor, newest) = sensor_mut(&mut self.sensors, &mut self.scans, event.source)?;
                 let removed = sensor.apply_scan(scan, newest, &mut self.motion, now, self.deadline_ns)?;
-                Outcome { completed_scan: Some(removed), packets_unfit: 0 }
+                InputOutcome { completed_scan: Some(removed), packets_unfit: 0 }
             }
             Body::End | Body::Withdrawn => {
                 self.check_may_end(event)?;
                 let (sensor, newest) = sensor_mut(&mut self.sensors, &mut self.scans, event.source)?;
                 let completed_scan = sensor.finish(newest, &mut self.motion, now);
-                Outcome { completed_scan, packets_unfit: sensor.drain_unfit() }
+                InputOutcome { completed_scan, packets_unfit: sensor.drain_unfit() }
             }
-            Body::EgoPose(pose) => self.apply_ego_pose(pose, now).map(|()| Outcome::default())?,
-            Body::Road(road) => self.apply_road(road, now).map(|()| Outcome::default())?,
-            Body::Sensor(sensor) => self.declare_sensor(event.source, sensor).map(|()| Outcome::default())?,
-            Body::Lost { .. } => Outcome::default(),
+            Body::EgoPose(pose) => self.apply_ego_pose(pose, now).map(|()| InputOutcome::default())?,
+            Body::Road(road) => self.apply_road(road, now).map(|()| InputOutcome::default())?,
+            Body::Sensor(sensor) => self.declare_sensor(event.source, sensor).map(|()| InputOutcome::default())?,
+            Body::Lost { .. } => InputOutcome::default(),
         };
         if outcome.completed_scan.is_some() {
             self.motion.note_scan_end(self.scans[usize::from(event.source)].end_ns);
@@ -171,13 +171,13 @@ impl Inputs {
         if self.scans[source].is_revolution { self.sensors[source].revolution() } else { None }
     }
 
-    fn apply_datagram(&mut self, source: u16, payload: &[u8], now: EventTime) -> Result<Outcome, EventError> {
+    fn apply_datagram(&mut self, source: u16, payload: &[u8], now: EventTime) -> Result<InputOutcome, EventError> {
         let (sensor, newest) = sensor_mut(&mut self.sensors, &mut self.scans, source)?;
         let completed_scan = sensor.apply_datagram(payload, newest, &mut self.motion, now)?;
         if payload.len() == TELEMETRY_LENGTH {
             sensor.apply_speed(&mut self.motion);
         }
-        Ok(Outcome { completed_scan, packets_unfit: sensor.drain_unfit() })
+        Ok(InputOutcome { completed_scan, packets_unfit: sensor.drain_unfit() })
     }
 
     /// Refuses a pose that is not newer than the newest one, unless no pose was accepted for the deadline: then the

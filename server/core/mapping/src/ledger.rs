@@ -9,7 +9,7 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::error::EventError;
 use crate::event::{Body, Cause, Event};
-use crate::inputs::Outcome;
+use crate::inputs::InputOutcome;
 use crate::sensor::self_filter::RemovedPoints;
 
 /// Greatest count of lost readings for each cause. A recording states these counts, and it may come from an untrusted
@@ -133,7 +133,7 @@ impl Ledgers {
     }
 
     /// Counts one event and what became of it.
-    pub fn record(&mut self, event: &Event, outcome: &Result<Outcome, EventError>) {
+    pub fn record(&mut self, event: &Event, outcome: &Result<InputOutcome, EventError>) {
         match (&event.body, outcome) {
             (Body::Datagram(_) | Body::Scan(_) | Body::End | Body::Withdrawn, Ok(outcome)) => {
                 self.record_reading(event, outcome)
@@ -167,7 +167,7 @@ impl Ledgers {
     }
 
     /// Counts an accepted datagram, scan or end of a sensor.
-    fn record_reading(&mut self, event: &Event, outcome: &Outcome) {
+    fn record_reading(&mut self, event: &Event, outcome: &InputOutcome) {
         let is_reading = !matches!(event.body, Body::End | Body::Withdrawn);
         let is_telemetry = matches!(&event.body, Body::Datagram(payload) if payload.len() == TELEMETRY_LENGTH);
         self.each(event.source, |ledger| {

@@ -20,13 +20,13 @@ pub const SYNTAX: &str = "lost:SENSOR@FROM-TO, loss:PERCENT or loss:PERCENT@FROM
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
     text: String,
-    kind: Kind,
+    kind: FaultKind,
     from_s: f64,
     to_s: f64,
 }
 
 #[derive(Clone, Debug, PartialEq)]
-enum Kind {
+enum FaultKind {
     /// A sensor sends nothing.
     Lost { sensor: String },
     /// This share of the datagrams and scans does not arrive.
@@ -67,23 +67,23 @@ impl FromStr for Fault {
         };
         let from_then_on = || Ok((number(when)?, f64::INFINITY));
         let (kind, (from_s, to_s)) = match name {
-            "lost" if !value.is_empty() => (Kind::Lost { sensor: value.to_owned() }, range()?),
+            "lost" if !value.is_empty() => (FaultKind::Lost { sensor: value.to_owned() }, range()?),
             "loss" => {
                 let percent = number(value)?;
                 if !(0.0..=100.0).contains(&percent) {
                     return Err(wrong(format!("{percent} %: 0 to 100 is allowed")));
                 }
                 let always = (f64::NEG_INFINITY, f64::INFINITY);
-                (Kind::Loss { share: percent / 100.0 }, if when.is_empty() { always } else { range()? })
+                (FaultKind::Loss { share: percent / 100.0 }, if when.is_empty() { always } else { range()? })
             }
-            "clock" => (Kind::Clock { step_ns: (number(value)? * 1e6) as i64 }, from_then_on()?),
+            "clock" => (FaultKind::Clock { step_ns: (number(value)? * 1e6) as i64 }, from_then_on()?),
             "pose" => {
                 let numbers = value.split(',').map(number).collect::<Result<Vec<_>, _>>()?;
                 let [x, y, yaw_deg] = numbers[..] else { return Err(wrong("X,Y,YAW are three numbers".into())) };
                 let moved = Isometry3::new(Vector3::new(x, y, 0.0), Vector3::z() * yaw_deg.to_radians());
-                (Kind::Pose { moved }, from_then_on()?)
+                (FaultKind::Pose { moved }, from_then_on()?)
             }
-            "stop" if value.is_empty() => (Kind::Stop, range()?),
+            "stop" if value.is_empty() => (FaultKind::Stop, range()?),
             _ => return Err(wrong("no such fault".into())),
         };
         Ok(Self { text: text.to_owned(), kind, from_s, to_s })
@@ -110,7 +110,7 @@ impl Faults {
                 let reason = format!("it begins after the drive, which is {length_s:.3} s long");
                 return Err(FaultError { text: fault.text.clone(), reason });
             }
-            if let Kind::Lost { sensor } = &fault.kind
+            if let FaultKind::Lost { sensor } = &fault.kind
                 && !sensors.iter().flatten().any(|name| name == sensor)
             {
                 let known = sensors.iter().flatten().cloned().collect::<Vec<_>>().join(", ");
@@ -131,15 +131,15 @@ impl Faults {
             let is_data = matches!(reading.body, Body::Datagram(_) | Body::Scan(_));
             let sensor = self.sensors.get(vehicle).and_then(|of| of.get(usize::from(reading.source)));
             let is_dropped = match &fault.kind {
-                Kind::Lost { sensor: lost } => is_data && sensor == Some(lost),
-                Kind::Loss { share: least } => is_data && share(index as u64, number) < *least,
-                Kind::Stop => !matches!(reading.body, Body::Sensor(_) | Body::Withdrawn | Body::End),
-                Kind::Clock { step_ns } => {
+                FaultKind::Lost { sensor: lost } => is_data && sensor == Some(lost),
+                FaultKind::Loss { share: least } => is_data && share(index as u64, number) < *least,
+                FaultKind::Stop => !matches!(reading.body, Body::Sensor(_) | Body::Withdrawn | Body::End),
+                FaultKind::Clock { step_ns } => {
                     reading.arrival_ns = reading.arrival_ns.saturating_add(*step_ns);
                     self.counts[index] += 1;
                     false
                 }
-                Kind::Pose { moved } => {
+                FaultKind::Pose { moved } => {
                     if let Body::EgoPose(pose) = &mut reading.body {
                         pose.map_from_ego = *moved * pose.map_from_ego;
                         self.counts[index] += 1;

@@ -29,7 +29,7 @@ use clearway_tests::roles::{Process, Role, name, server_config};
 
 /// Faults between machines.
 #[derive(Parser)]
-struct Arguments {
+struct MachinesArguments {
     #[command(subcommand)]
     role: Option<Role>,
     /// Time for which each fault lasts, in seconds.
@@ -65,7 +65,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const CALM: Duration = Duration::from_secs(2);
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = MachinesArguments::parse();
     match &arguments.role {
         Some(role) => role.run(),
         None if arguments.uplink => return uplink::run(&arguments),
@@ -234,7 +234,7 @@ impl Bed {
     }
 }
 
-fn run(arguments: &Arguments) -> ExitCode {
+fn run(arguments: &MachinesArguments) -> ExitCode {
     let (all, asked) = (faults(), &arguments.faults);
     if let Some(unknown) = asked.iter().find(|name| all.iter().all(|fault| fault.name != **name)) {
         let known: Vec<_> = all.iter().map(|fault| fault.name).collect();

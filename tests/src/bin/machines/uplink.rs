@@ -16,7 +16,7 @@ use clearway_daemon::config::Service;
 use clearway_tests::machines::{Machines, ROUTERS, command, sent_bytes};
 use clearway_tests::roles::{Process, server_config};
 
-use crate::Arguments;
+use crate::MachinesArguments;
 
 const VEHICLE: &str = "v00";
 const OTHER: &str = "v01";
@@ -89,7 +89,7 @@ struct Bed {
 }
 
 /// Runs all phases, then the recording.
-pub fn run(arguments: &Arguments) -> ExitCode {
+pub fn run(arguments: &MachinesArguments) -> ExitCode {
     let (machines, seen) = (Machines::start(arguments.server.as_ref()), Seen::default());
     let mut bed = Bed { machines, seen, valid_ms: arguments.valid_ms, python: arguments.python.clone() };
     (0..2).for_each(|index| bed.machines.start_router(index));

@@ -53,7 +53,7 @@ struct Front {
 
 /// What is known of a cell of the row that grows.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Outcome {
+enum CellOutcome {
     /// No return, or only mirror images.
     Nothing,
     /// The lowest return is too high to be ground.
@@ -66,7 +66,7 @@ enum Outcome {
 #[derive(Clone)]
 pub struct Growth {
     fronts: Vec<Front>,
-    outcomes: Vec<Outcome>,
+    outcomes: Vec<CellOutcome>,
     /// By cell: height of the ground at the middle of the cell, metres; NaN without ground.
     heights_m: Vec<f32>,
 }
@@ -75,7 +75,7 @@ impl Default for Growth {
     fn default() -> Self {
         Self {
             fronts: vec![Front::default(); COLUMNS],
-            outcomes: vec![Outcome::Nothing; COLUMNS],
+            outcomes: vec![CellOutcome::Nothing; COLUMNS],
             heights_m: vec![f32::NAN; CELLS],
         }
     }
@@ -101,7 +101,7 @@ impl Growth {
         }
         self.heights_m.fill(f32::NAN);
         for row in 0..ROWS {
-            self.outcomes.fill(Outcome::Nothing);
+            self.outcomes.fill(CellOutcome::Nothing);
             for round in 0..ROUNDS {
                 if !self.judge_row(row, round, cells) {
                     break;
@@ -128,9 +128,9 @@ impl Growth {
         for column in 0..COLUMNS {
             let cell = row * COLUMNS + column;
             let is_open = match self.outcomes[column] {
-                Outcome::Nothing => round == 0 && cells.is_seen(cell),
-                Outcome::Obstacle => true,
-                Outcome::Ground { .. } => false,
+                CellOutcome::Nothing => round == 0 && cells.is_seen(cell),
+                CellOutcome::Obstacle => true,
+                CellOutcome::Ground { .. } => false,
             };
             if is_open {
                 self.outcomes[column] = self.judge(cell, end_m - start_m, column_m, cells);
@@ -141,7 +141,7 @@ impl Growth {
     }
 
     /// Judges one cell.
-    fn judge(&self, cell: usize, row_m: f32, column_m: f32, cells: &PolarCells) -> Outcome {
+    fn judge(&self, cell: usize, row_m: f32, column_m: f32, cells: &PolarCells) -> CellOutcome {
         let column = cell % COLUMNS;
         let with_object = cells.span_m(cell) > OBJECT_M[0] + OBJECT_M[1] * row_m;
         let above = if with_object { ABOVE_IN_OBJECT_M } else { ABOVE_M };
@@ -152,17 +152,17 @@ impl Growth {
             let over_m = point.z_m - predicted_m;
             if over_m > above[0] + above[1] * distance_m {
                 if with_object || !self.rises(cell, point, cells) {
-                    return Outcome::Obstacle;
+                    return CellOutcome::Obstacle;
                 }
                 // The rise is confirmed, so that the height needs no filter.
                 let Return { range_m, z_m } = point;
-                return Outcome::Ground { range_m, z_m, with_object, predicted_m: z_m };
+                return CellOutcome::Ground { range_m, z_m, with_object, predicted_m: z_m };
             }
             if over_m >= -(BELOW_M[0] + BELOW_M[1] * distance_m) {
-                return Outcome::Ground { range_m: point.range_m, z_m: point.z_m, with_object, predicted_m };
+                return CellOutcome::Ground { range_m: point.range_m, z_m: point.z_m, with_object, predicted_m };
             }
         }
-        Outcome::Nothing
+        CellOutcome::Nothing
     }
 
     /// True if a return above the prediction is the first one of rising ground: if the next returns of its column
@@ -206,7 +206,7 @@ impl Growth {
     /// Moves the fronts to the ground that was found, in a row of this length.
     fn advance_fronts(&mut self, row_m: f32) {
         for (front, outcome) in self.fronts.iter_mut().zip(&self.outcomes) {
-            if let Outcome::Ground { range_m, z_m, with_object, predicted_m } = *outcome
+            if let CellOutcome::Ground { range_m, z_m, with_object, predicted_m } = *outcome
                 && range_m > front.range_m
             {
                 let height_m = predicted_m + HEIGHT_SHARE * (z_m - predicted_m);
@@ -228,9 +228,9 @@ impl Growth {
         for (column, (front, outcome)) in self.fronts.iter_mut().zip(&self.outcomes).enumerate() {
             let cell = row * COLUMNS + column;
             match *outcome {
-                Outcome::Nothing => {}
-                Outcome::Obstacle => front.is_blocked = true,
-                Outcome::Ground { range_m, z_m, .. } => {
+                CellOutcome::Nothing => {}
+                CellOutcome::Obstacle => front.is_blocked = true,
+                CellOutcome::Ground { range_m, z_m, .. } => {
                     self.heights_m[cell] = z_m + front.slope * (middle_m - range_m);
                 }
             }

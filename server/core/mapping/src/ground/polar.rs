@@ -29,7 +29,7 @@ const KEPT: usize = 3;
 /// Return of a cell without one.
 const NONE: u32 = u32::MAX;
 /// A cell without returns.
-const EMPTY: Cell = Cell { lowest: [NONE; KEPT], highest: 0 };
+const EMPTY: PolarCell = PolarCell { lowest: [NONE; KEPT], highest: 0 };
 /// Offset that makes each height positive, metres, plus half a millimetre for rounding.
 const OFFSET_M: f32 = 32.0005;
 /// Steps of a return's place within its cell, along the range and along the azimuth.
@@ -49,13 +49,13 @@ pub struct Return {
 /// The returns that are kept of a cell: height in millimetres in the upper 16 bits, then the place within the cell
 /// along the range and along the azimuth, 8 bits each.
 #[derive(Clone, Copy)]
-struct Cell {
+struct PolarCell {
     /// Ascending.
     lowest: [u32; KEPT],
     highest: u32,
 }
 
-impl Cell {
+impl PolarCell {
     /// It has no branches: which returns are kept cannot be predicted.
     #[inline(always)]
     fn add_return(&mut self, key: u32) {
@@ -70,7 +70,7 @@ impl Cell {
 pub struct PolarCells {
     azimuths: AzimuthColumns,
     outline: Outline,
-    cells: Vec<Cell>,
+    cells: Vec<PolarCell>,
     /// Row and column coordinate by point of the sweep.
     coordinates: [Vec<f32>; 2],
 }
@@ -145,7 +145,7 @@ impl PolarCells {
 
     /// Height of the cell's highest return over its lowest one, metres; 0 without returns.
     pub fn span_m(&self, cell: usize) -> f32 {
-        let Cell { lowest: [lowest, ..], highest } = self.cells[cell];
+        let PolarCell { lowest: [lowest, ..], highest } = self.cells[cell];
         if lowest == NONE { 0.0 } else { ((highest >> 16) as f32 - (lowest >> 16) as f32) * 1e-3 }
     }
 

@@ -49,7 +49,7 @@ const DIRECTIONS: usize = AzimuthColumns::TWO_DEGREES as usize;
 
 /// What one cell of the world holds.
 #[derive(Clone, Copy, Debug, Default)]
-struct Cell {
+struct MemoryCell {
     /// World index (x, y) of the cell that is stored here.
     world: [i64; 2],
     /// Height of the lowest ground of the newest map that saw it, world frame, metres.
@@ -67,7 +67,7 @@ struct Cell {
 /// The memory of one vehicle.
 #[derive(Clone)]
 pub(crate) struct Memory {
-    cells: Vec<Cell>,
+    cells: Vec<MemoryCell>,
     /// Indices of the cells that hold something.
     listed: Vec<u32>,
     /// Pose and stamp of the newest map; `None` without a pose.
@@ -94,7 +94,7 @@ impl Memory {
     /// An empty memory; `None` if the configuration disables it.
     pub fn new(config: &MemoryConfig) -> Option<Self> {
         config.enabled.then(|| Self {
-            cells: vec![Cell::default(); (SIDE * SIDE) as usize],
+            cells: vec![MemoryCell::default(); (SIDE * SIDE) as usize],
             listed: Vec::new(),
             newest: None,
             extended: Sweep::default(),
@@ -154,7 +154,7 @@ impl Memory {
             self.listed.push(index as u32);
         }
         if cell.world != world {
-            *cell = Cell { world, ..Cell::default() };
+            *cell = MemoryCell { world, ..MemoryCell::default() };
         }
         if let Some(height_m) = obstacle {
             if cell.obstacle_ns != stamp_ns || point.z > cell.obstacle_m {
@@ -259,7 +259,7 @@ impl Memory {
 
     fn forget(&mut self) {
         for index in self.listed.drain(..) {
-            self.cells[index as usize] = Cell::default();
+            self.cells[index as usize] = MemoryCell::default();
         }
         self.state.drops += 1;
     }

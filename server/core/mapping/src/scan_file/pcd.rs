@@ -14,7 +14,7 @@ const RING_FIELDS: [&str; 4] = ["ring", "channel", "laser", "laser_id"];
 /// [`ScanFileError::Pcd`] if an entry of the header is missing or not allowed, if the file contains fewer points than
 /// its header states, or if a value is no number.
 pub fn read_pcd(bytes: &[u8]) -> Result<Scan, ScanFileError> {
-    let (header, rest) = Header::read(bytes)?;
+    let (header, rest) = PcdHeader::read(bytes)?;
     let points = header.points()?;
     let fields = header.used_fields()?;
     let mut scan = match header.data.as_str() {
@@ -96,7 +96,7 @@ fn scan_of(points: impl Iterator<Item = [f64; 5]>, fields: [Option<Field>; 5]) -
 
 /// The type of a field's values.
 #[derive(Clone, Copy)]
-enum Kind {
+enum FieldKind {
     F32,
     F64,
     /// Signed whole number of this many bytes.
@@ -105,7 +105,7 @@ enum Kind {
     Unsigned(usize),
 }
 
-impl Kind {
+impl FieldKind {
     fn new(kind: &str, size: usize) -> Option<Self> {
         match (kind, size) {
             ("F", 4) => Some(Self::F32),
@@ -143,7 +143,7 @@ impl Kind {
 /// Type and position of one field in a point of a PCD file.
 #[derive(Clone, Copy)]
 struct Field {
-    kind: Kind,
+    kind: FieldKind,
     /// Index of the field among the numbers of an ASCII line.
     column: usize,
     /// First byte of the field in a binary point.
@@ -152,7 +152,7 @@ struct Field {
 
 /// The entries of a PCD file's header.
 #[derive(Default)]
-struct Header {
+struct PcdHeader {
     fields: Vec<String>,
     sizes: Vec<usize>,
     types: Vec<String>,
@@ -162,7 +162,7 @@ struct Header {
     data: String,
 }
 
-impl Header {
+impl PcdHeader {
     /// Reads the header; returns it with the bytes behind it. A word that is not a number is read as 0, which no field
     /// may have.
     fn read(bytes: &[u8]) -> Result<(Self, &[u8]), ScanFileError> {
@@ -214,7 +214,7 @@ impl Header {
     fn used_fields(&self) -> Result<[Option<Field>; 5], ScanFileError> {
         let find = |name: &str| {
             let index = self.fields.iter().position(|field| field == name)?;
-            let kind = Kind::new(&self.types[index], self.sizes[index]).filter(|_| self.counts[index] == 1)?;
+            let kind = FieldKind::new(&self.types[index], self.sizes[index]).filter(|_| self.counts[index] == 1)?;
             let column = self.counts[..index].iter().copied().fold(0, usize::saturating_add);
             Some(Field { kind, column, offset: self.bytes_before(index) })
         };

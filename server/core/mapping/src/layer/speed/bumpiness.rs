@@ -36,7 +36,7 @@ const CHUNK: usize = 256;
 const NOT_USED: i32 = i32::MIN;
 /// Sums of one cell's heights, mm.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Cell {
+struct BumpinessCell {
     highest: i16,
     lowest: i16,
     /// Largest height over the ground.
@@ -46,7 +46,7 @@ struct Cell {
     squares: i64,
 }
 
-impl Cell {
+impl BumpinessCell {
     #[inline(always)]
     fn add_point(&mut self, [millimetres, over_ground]: [i16; 2]) {
         let wide = i64::from(millimetres);
@@ -59,15 +59,15 @@ impl Cell {
     }
 }
 
-const EMPTY: Cell =
-    Cell { highest: i16::MIN, lowest: i16::MAX, highest_over_ground: i16::MIN, points: 0, sum: 0, squares: 0 };
+const EMPTY: BumpinessCell =
+    BumpinessCell { highest: i16::MIN, lowest: i16::MAX, highest_over_ground: i16::MIN, points: 0, sum: 0, squares: 0 };
 
 /// Heights of a grid of `side` cells along x and y with the vehicle in the middle: index = iy * side + ix.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeightMap {
     side: usize,
     cell_m: f32,
-    cells: Vec<Cell>,
+    cells: Vec<BumpinessCell>,
     /// Indices of the cells with a point, in the order in which points fell into them.
     seen: Vec<u32>,
     /// By cell: mean height, metres; NaN without points.
