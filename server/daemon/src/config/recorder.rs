@@ -23,9 +23,7 @@ pub struct Recorder {
     pub part_mb: u64,
     /// Time in seconds after which the next part begins; 0: no limit.
     pub part_s: u64,
-    /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded: more
-    /// than any layer or the memory remembers, so that a new part changes no map. A constant but in tests.
-    #[serde(skip)]
+    /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded.
     pub warm_up_ms: u64,
     /// Total length in MiB beyond which the oldest parts are deleted; 0: none is.
     pub keep_mb: u64,
@@ -92,6 +90,7 @@ impl Recorder {
             ("recorder.flush_ms", self.flush_ms, 10..=60_000, "10 to 60000 ms"),
             ("recorder.part_mb", self.part_mb, 0..=1 << 20, "0 to 1048576 MiB"),
             ("recorder.part_s", self.part_s, 0..=86_400, "0 to 86400 s"),
+            ("recorder.warm_up_ms", self.warm_up_ms, 100..=600_000, "100 to 600000 ms"),
             ("recorder.keep_mb", self.keep_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
             ("recorder.keep_hours", self.keep_hours, 0..=876_000, "0 to 876000 h"),
             ("recorder.saved_mb", self.saved_mb, 0..=1 << 30, "0 to 1073741824 MiB"),

@@ -128,9 +128,8 @@ const CONSTANTS: [(&str, &str, &str); 67] = [
 ];
 
 /// Keys of other tables that earlier versions had. They changed no map that is computed again.
-const REMOVED: [(&str, &str); 10] = [
+const REMOVED: [(&str, &str); 9] = [
     ("recorder", "queue"),
-    ("recorder", "warm_up_ms"),
     ("connections", "kept"),
     ("connections", "calls_max"),
     ("connections", "calls_per_address_max"),

@@ -11,6 +11,8 @@ use clearway_tests::{binaries, workspace};
 
 use super::{said, succeeds};
 
+/// The release of Debian that the container file names.
+const RELEASE: &str = "trixie";
 /// Starts a program in the root `$1` as the image's user: nothing but /data can be written, no capability is left, and
 /// none can be gained. `$2` is the folder of the configuration.
 const START: &str = r#"set -e
@@ -42,12 +44,19 @@ impl Buildah {
 /// of its root file system.
 fn built(buildah: &Buildah) -> PathBuf {
     let base = buildah.0.join("base.tar");
-    let lists = ["/etc/apt/sources.list.d/debian.sources", "/etc/apt/sources.list"];
-    let lists = lists.iter().filter(|list| fs::metadata(list).is_ok_and(|of| of.len() > 0));
-    succeeds(Command::new("mmdebstrap").args(["--quiet", "--variant=minbase", "bookworm"]).arg(&base).args(lists));
+    let mut debian = Command::new("mmdebstrap");
+    debian.args(["--quiet", "--variant=minbase", RELEASE]).arg(&base);
+    for list in ["/etc/apt/sources.list.d/debian.sources", "/etc/apt/sources.list"].map(Path::new) {
+        let Some(text) = fs::read_to_string(list).ok().filter(|text| !text.is_empty()) else { continue };
+        // The mirrors of this machine, whose own release may be another one.
+        let of_release = buildah.0.join(list.file_name().expect("it has a name"));
+        fs::write(&of_release, text.replace("bookworm", RELEASE)).expect("a file of ours");
+        debian.arg(of_release);
+    }
+    succeeds(&mut debian);
     let container = buildah.run(&["from", "scratch"]);
     buildah.run(&["add", "--quiet", &container, &base.display().to_string(), "/"]);
-    buildah.run(&["commit", "--quiet", "--rm", &container, "docker.io/library/debian:bookworm-slim"]);
+    buildah.run(&["commit", "--quiet", "--rm", &container, &format!("docker.io/library/debian:{RELEASE}-slim")]);
 
     let stage = buildah.0.join("build");
     fs::create_dir_all(stage.join("etc/ssl/certs")).expect("a folder of ours");

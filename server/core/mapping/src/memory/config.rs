@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 pub(super) const RANGE_M_MAX: f32 = 25.0;
 
 /// Age from which ground is forgotten, seconds. 5 is ours: a drift of 1 % of the way is then 0.4 m at 8 m/s.
-pub(crate) const GROUND_S_MAX: f32 = 5.0;
+pub const GROUND_S_MAX: f32 = 5.0;
 
 /// Age from which an obstacle that is not seen again is forgotten, seconds. 0.3 is ours: three revolutions; the
 /// cell is then unknown, not free.

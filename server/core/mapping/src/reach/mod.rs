@@ -20,7 +20,7 @@
 //! | reached cells -> those without a detour over farther ground | `directions` |
 
 pub(crate) mod bits;
-mod blind_zone;
+pub(crate) mod blind_zone;
 pub(crate) mod cells;
 pub mod config;
 mod directions;
@@ -42,7 +42,7 @@ use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 
 use bits::Bits;
-use blind_zone::BlindZone;
+use blind_zone::{BlindZone, is_of_ground};
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
 use directions::Directions;
@@ -307,6 +307,16 @@ impl Reach {
     /// The cells that are neither open nor filled by a closing of the open cells.
     pub(crate) fn outside(&self) -> &Bits {
         &self.outside
+    }
+
+    /// Height that the returns of a cell's obstacle span, metres; negative without an obstacle.
+    pub(crate) fn obstacle_height_m(&self, cell: usize) -> f32 {
+        self.obstacles.height_m(cell)
+    }
+
+    /// True if no tall obstacle stands beside a cell, which is not at the border of the grid.
+    pub(crate) fn is_of_ground(&self, ix: usize, iy: usize) -> bool {
+        is_of_ground(ix, iy, |cell| self.obstacles.height_m(cell))
     }
 
     /// By cell: lowest and highest return from the ground, millimetres, ego frame; the lowest is the larger number

@@ -4,7 +4,8 @@
 //! beyond it. The returns of an azimuth are taken in the order of their elevation, as the lasers of a sensor see them:
 //! in the order of their ranges the floor of a trench may lie beside its near edge. Ground goes on as the 2.5 m before
 //! it; a return that lies deeper than this line shows a drop. Two of three azimuths must agree. Under the first ring no
-//! ground lies before the drop: there the first return counts that lies deeper than the plane under the vehicle.
+//! ground lies before the drop: there the first return counts that lies deeper than the plane under the vehicle, or than
+//! its wheels, and the drop may begin right beside the vehicle. What is found ahead and behind goes on beside it.
 //!
 //! From a height of 1.8 m a trench of 2 m shows its far side 0.5 m deep at 7 m, and 0.2 m at 15 m: one farther away, or
 //! a hole of less than 0.6 m, is not seen.
@@ -13,6 +14,7 @@ use crate::ground::Ground;
 use crate::ground::polar::{COLUMNS, ROWS, Return, beside, column_directions, row_start_m};
 use crate::reach::Reach;
 use crate::reach::bits::Bits;
+use crate::reach::blind_zone::BlindZone;
 use crate::reach::cells::{CELL_M, SIDE, centre_m};
 
 /// Greatest range of the ground before a drop, metres. Ours; see above.
@@ -33,6 +35,10 @@ const GROUND_M: std::ops::Range<f32> = -1.6..0.25;
 const FIRST_DEPTH_M_MIN: f32 = 0.3;
 const FIRST_SHARE_MIN: f32 = 0.06;
 const FIRST_M_MAX: f32 = 10.0;
+/// Least depth of the first return under the level of the wheels, metres, and what is added as a share of its range.
+/// Ours: where a trench fills the view, the plane is that of its floor; and 10 % down is a slope.
+const WHEELS_M_MIN: f32 = 0.25;
+const WHEELS_SHARE: f32 = 0.1;
 /// How far a drop reaches beyond its two returns, metres. Ours: half a cell, and a cell.
 const EDGES_M: [f32; 2] = [0.1, 0.25];
 /// Number of steps of a cell's side that are kept of a column: bits of a number.
@@ -46,7 +52,10 @@ pub struct Drops {
     returns: Vec<Return>,
     /// By column: one bit for each [`CELL_M`] of range, set in a drop.
     spans: Vec<u128>,
+    blind_zone: BlindZone,
     found: Bits,
+    /// The cells of drops beside the vehicle, between those ahead and behind.
+    beside: Bits,
 }
 
 impl Drops {
@@ -56,7 +65,9 @@ impl Drops {
             directions: column_directions(),
             returns: Vec::new(),
             spans: vec![0; COLUMNS],
+            blind_zone: BlindZone::new(),
             found: Bits::square(SIDE),
+            beside: Bits::square(SIDE),
         }
     }
 
@@ -64,10 +75,15 @@ impl Drops {
     pub fn find(&mut self, ground: &Ground, reach: &Reach, sensor_m: f32) -> &Bits {
         for column in 0..COLUMNS {
             self.sort_returns(ground, column, sensor_m);
-            self.spans[column] = self.span(ground, column, sensor_m, reach.config().clearance_m + DEPTH_OVER_M);
+            self.spans[column] = self.span(ground, column, reach.config().clearance_m + DEPTH_OVER_M);
         }
         self.mark(reach);
-        &self.found
+        let Self { found, beside, blind_zone, .. } = self;
+        beside.clear();
+        let confidences = ground.confidences();
+        blind_zone.find(found, |cell| reach.obstacle_height_m(cell), confidences, |ix, iy| beside.set(ix, iy));
+        found.add(beside);
+        found
     }
 
     fn sort_returns(&mut self, ground: &Ground, column: usize, sensor_m: f32) {
@@ -83,17 +99,9 @@ impl Drops {
     }
 
     /// The bits of a column's drops.
-    fn span(&self, ground: &Ground, column: usize, sensor_m: f32, depth_m_min: f32) -> u128 {
-        let mut span = 0;
-        if let Some(first) = self.returns.first().filter(|first| first.range_m < FIRST_M_MAX) {
-            let [cos, sin] = self.directions[column];
-            let plane_m = ground.near_plane().height_m(first.range_m * cos, first.range_m * sin);
-            let (depth_m, fall) = (plane_m - first.z_m, (sensor_m - first.z_m) / first.range_m);
-            if ground.near_plane().is_seen && depth_m > FIRST_DEPTH_M_MIN.max(FIRST_SHARE_MIN * first.range_m) {
-                // Without the drop the ray had met the plane here.
-                span |= bits((sensor_m - plane_m) / fall - EDGES_M[1], first.range_m + EDGES_M[1]);
-            }
-        }
+    fn span(&self, ground: &Ground, column: usize, depth_m_min: f32) -> u128 {
+        let first = self.returns.first().filter(|first| is_below_vehicle(ground, self.directions[column], first));
+        let mut span = first.map_or(0, |first| bits(0.0, first.range_m + EDGES_M[1]));
         for (at, pair) in self.returns.windows(2).enumerate() {
             let [before, after] = [pair[0], pair[1]];
             let gap_m = after.range_m - before.range_m;
@@ -142,6 +150,14 @@ impl Drops {
             }
         }
     }
+}
+
+/// True if the first return of a column is near, and lies deeper than the ground under the vehicle.
+fn is_below_vehicle(ground: &Ground, [cos, sin]: [f32; 2], first: &Return) -> bool {
+    let (plane, Return { range_m, z_m }) = (ground.near_plane(), *first);
+    let depth_m = plane.height_m(range_m * cos, range_m * sin) - z_m;
+    let is_below_plane = plane.is_seen && depth_m > FIRST_DEPTH_M_MIN.max(FIRST_SHARE_MIN * range_m);
+    range_m < FIRST_M_MAX && (is_below_plane || -z_m > WHEELS_M_MIN + WHEELS_SHARE * range_m)
 }
 
 /// The bits from one range to another one.

@@ -7,11 +7,12 @@
 //! ground, such as grass, scores everywhere; a cell must score more there. A cell that scores little more than it must
 //! needs a neighbour.
 //!
-//! A step of the ground that is higher than the clearance is low too: its higher side.
+//! A step of the ground that is higher than the clearance is low too: its higher side. So is the cell right behind a low
+//! one that no return fell into: the thing hides its own back.
 
 use crate::reach::Reach;
 use crate::reach::bits::Bits;
-use crate::reach::cells::{CELL_M, SIDE, centre_m};
+use crate::reach::cells::{CELL_M, SIDE, cell, centre_m};
 
 /// Number of cells along a side of the square in which low things are sought, in the middle of the grid: to 26 m.
 const WINDOW: usize = 208;
@@ -170,6 +171,19 @@ impl LowThings {
             }
         });
     }
+}
+
+/// Writes the cells without a return right behind low ones.
+pub fn find_backs(reach: &Reach, low: &Bits, backs: &mut Bits) {
+    backs.clear();
+    low.each(|ix, iy| {
+        let [x, y] = centre_m(iy * SIDE + ix);
+        let farther = 1.0 + CELL_M / libm::hypotf(x, y);
+        let behind = cell(x * farther, y * farther) as usize;
+        if behind < SIDE * SIDE && !reach.bits().seen.get(behind % SIDE, behind / SIDE) {
+            backs.set(behind % SIDE, behind / SIDE);
+        }
+    });
 }
 
 /// True if a cell of the window is within a distance of the vehicle.

@@ -9,6 +9,7 @@
 //! |---|---|
 //! | what stands over the ground on both sides of it -> low cells | `low_things` |
 //! | returns that lie deeper than the ground before them -> cells of drops | `drops` |
+//! | the same that earlier maps found, where poses are known -> cells that this map does not show | `remembered` |
 //! | the reach stage's flood, with these cells as barriers -> covered cells | [`crate::reach`] |
 //! | gaps between rays that pass too high -> cells that are not free | `unproved` |
 //! | even cells beside a step -> free cells | `releases` |
@@ -22,6 +23,7 @@ mod drops;
 mod low_things;
 mod patches;
 mod releases;
+mod remembered;
 mod unproved;
 
 use crate::layer::channel::TypedChannel;
@@ -42,10 +44,11 @@ use config::FreespaceConfig;
 use drops::Drops;
 use low_things::LowThings;
 use patches::Patches;
+use remembered::Remembered;
 use unproved::Unproved;
 
-/// Distance to the vehicle's outline within which nothing is low and no drop is found, metres. Ours: the returns of the
-/// vehicle's own sides.
+/// Distance to the vehicle's outline within which nothing low is found, metres. Ours: the returns of the vehicle's own
+/// sides.
 const OWN_M: f32 = 0.5;
 
 /// Maker of the layer `freespace`. It reuses its buffers.
@@ -54,6 +57,7 @@ pub struct Freespace {
     config: FreespaceConfig,
     low_things: LowThings,
     drops: Drops,
+    remembered: Remembered,
     unproved: Unproved,
     patches: Patches,
     flood: Flood,
@@ -78,6 +82,7 @@ impl Freespace {
             config: config.clone(),
             low_things: LowThings::new(),
             drops: Drops::new(),
+            remembered: Remembered::default(),
             unproved: Unproved::new(),
             patches: Patches::new(),
             flood: Flood::new(SIDE),
@@ -118,7 +123,21 @@ impl Freespace {
     /// Finds which cells are free, and what closes the others.
     fn find<'a>(&'a mut self, sweep: &Sweep, context: &Context<'_>, reach: &'a Reach) -> Findings<'a> {
         let Self {
-            low_things, drops, unproved, patches, flood, barred, low, drop, free, stepped, released, own, ..
+            low_things,
+            drops,
+            remembered,
+            unproved,
+            patches,
+            flood,
+            barred,
+            low,
+            drop,
+            free,
+            stepped,
+            released,
+            vehicle,
+            own,
+            ..
         } = self;
         low.copy_from(low_things.find(reach));
         low.remove(own);
@@ -126,7 +145,13 @@ impl Freespace {
             Some(ground) => drop.copy_from(drops.find(ground, reach, sweep.mount_height_m)),
             None => drop.clear(),
         }
-        drop.remove(own);
+        remembered.add(context, reach, [low, drop]);
+        low_things::find_backs(reach, low, barred);
+        low.add(barred);
+        // What the vehicle stands on does not close its way.
+        for closed in [&mut *low, &mut *drop] {
+            vehicle.iter().for_each(|cell| closed.clear_cell(cell % SIDE, cell / SIDE));
+        }
         reach.flood_with([low, drop], barred, flood);
         let covered = flood.covered();
         free.copy_from(covered);
