@@ -4,8 +4,8 @@
 //! beyond it. The returns of an azimuth are taken in the order of their elevation, as the lasers of a sensor see them:
 //! in the order of their ranges the floor of a trench may lie beside its near edge. Ground goes on as the 2.5 m before
 //! it; a return that lies deeper than this line shows a drop. Two of three azimuths must agree. Under the first ring no
-//! ground lies before the drop: there the first return counts that lies deeper than the plane under the vehicle, or than
-//! its wheels, and the drop may begin right beside the vehicle. What is found ahead and behind goes on beside it.
+//! ground lies before the drop: there the first return counts that lies deeper than the plane under the vehicle, or
+//! than its wheels, and the drop may begin at the vehicle. What is found ahead and behind goes on beside it.
 //!
 //! From a height of 1.8 m a trench of 2 m shows its far side 0.5 m deep at 7 m, and 0.2 m at 15 m: one farther away, or
 //! a hole of less than 0.6 m, is not seen.

@@ -7,8 +7,8 @@
 //! ground, such as grass, scores everywhere; a cell must score more there. A cell that scores little more than it must
 //! needs a neighbour.
 //!
-//! A step of the ground that is higher than the clearance is low too: its higher side. So is the cell right behind a low
-//! one that no return fell into: the thing hides its own back.
+//! A step of the ground that is higher than the clearance is low too: its higher side. So is the cell right behind a
+//! low one that no return fell into: the thing hides its own back.
 
 use crate::reach::Reach;
 use crate::reach::bits::Bits;
@@ -61,7 +61,9 @@ pub struct LowThings {
     means: Vec<i16>,
     best: Vec<i16>,
     scores: Vec<i16>,
-    found: Bits,
+    things: Bits,
+    /// The higher sides of low steps.
+    steps: Bits,
 }
 
 impl LowThings {
@@ -77,16 +79,17 @@ impl LowThings {
             means: vec![i16::MAX; cells],
             best: vec![NONE; cells],
             scores: vec![NONE; cells],
-            found: Bits::square(SIDE),
+            things: Bits::square(SIDE),
+            steps: Bits::square(SIDE),
         }
     }
 
-    /// Finds the low cells of the newest map.
-    pub fn find(&mut self, reach: &Reach) -> &Bits {
+    /// Finds the low cells of the newest map: those of things, and those of steps.
+    pub fn find(&mut self, reach: &Reach) -> [&Bits; 2] {
         self.copy_heights(reach);
         self.score();
         self.judge(reach);
-        &self.found
+        [&self.things, &self.steps]
     }
 
     fn copy_heights(&mut self, reach: &Reach) {
@@ -145,7 +148,8 @@ impl LowThings {
             let raised = i32::from(rough_mm - even_mm) * (10 * rough - scored).clamp(0, 2 * scored) / (2 * scored);
             self.scores[at] >= even_mm + more_mm + raised as i16
         };
-        self.found.clear();
+        self.things.clear();
+        self.steps.clear();
         for at in (MARGIN * WINDOW..(WINDOW - MARGIN) * WINDOW).filter(|at| self.scores[*at] >= even_mm) {
             let (ix, iy) = (at % WINDOW, at / WINDOW);
             if !(MARGIN..WINDOW - MARGIN).contains(&ix) || !over(at, 0) || !is_within(ix, iy, RANGE_M_MAX) {
@@ -154,20 +158,20 @@ impl LowThings {
             let neighbours = (iy - 1..=iy + 1).flat_map(|iy| (ix - 1..=ix + 1).map(move |ix| iy * WINDOW + ix));
             let mut others = neighbours.filter(|other| *other != at);
             if over(at, ALONE_MM) || others.clone().any(|other| over(other, 0)) {
-                self.found.set(FIRST + ix, FIRST + iy);
+                self.things.set(FIRST + ix, FIRST + iy);
                 // The ends of a thing fill a part of their cells only.
                 let ends = others.by_ref().filter(|other| self.scores[*other] >= ROUGH_SCORE_MM.start);
-                ends.for_each(|other| self.found.set(FIRST + other % WINDOW, FIRST + other / WINDOW));
+                ends.for_each(|other| self.things.set(FIRST + other % WINDOW, FIRST + other / WINDOW));
             }
         }
-        let (found, sums) = (&mut self.found, (&self.low_sums.sums, &self.count_sums.sums));
+        let (steps, sums) = (&mut self.steps, (&self.low_sums.sums, &self.count_sums.sums));
         let half = (STEP_RANGE_M_MAX / CELL_M) as usize;
         reach.each_step(reach.config().clearance_m + STEP_OVER_M, half, |cell| {
             let (ix, iy) = (cell % SIDE - FIRST, cell / SIDE - FIRST);
             // Grass is full of steps.
             let is_even = 3 * sums.0[iy * WINDOW + ix] <= sums.1[iy * WINDOW + ix];
             if is_even && is_within(ix, iy, STEP_RANGE_M_MAX) {
-                found.set(FIRST + ix, FIRST + iy);
+                steps.set(FIRST + ix, FIRST + iy);
             }
         });
     }

@@ -47,8 +47,8 @@ use patches::Patches;
 use remembered::Remembered;
 use unproved::Unproved;
 
-/// Distance to the vehicle's outline within which nothing low is found, metres. Ours: the returns of the vehicle's own
-/// sides.
+/// Distance to the vehicle's outline within which nothing is low and no drop is found, metres. Ours: the returns of the
+/// vehicle's own sides.
 const OWN_M: f32 = 0.5;
 
 /// Maker of the layer `freespace`. It reuses its buffers.
@@ -139,13 +139,17 @@ impl Freespace {
             own,
             ..
         } = self;
-        low.copy_from(low_things.find(reach));
-        low.remove(own);
+        let [things, steps] = low_things.find(reach);
+        low.copy_from(things);
         match context.ground {
             Some(ground) => drop.copy_from(drops.find(ground, reach, sweep.mount_height_m)),
             None => drop.clear(),
         }
+        [&mut *low, &mut *drop].into_iter().for_each(|found| found.remove(own));
         remembered.add(context, reach, [low, drop]);
+        barred.copy_from(steps);
+        barred.remove(own);
+        low.add(barred);
         low_things::find_backs(reach, low, barred);
         low.add(barred);
         // What the vehicle stands on does not close its way.
