@@ -10,7 +10,6 @@ use std::path::Path;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::SensorConfig;
-use clearway_mapping::memory::config::GROUND_S_MAX;
 use serde::{Deserialize, Serialize};
 
 use crate::base::file_advice::{advised, read_text};
@@ -306,20 +305,13 @@ impl Config {
         self.grpc.check()?;
         self.page.check()?;
         self.connections.check()?;
-        self.recorder.check()?;
+        self.recorder.check(self.vehicles.iter().any(|vehicle| vehicle.maps.memory.enabled))?;
         self.store.check()?;
         self.traces.check()?;
         self.zenoh.check(&self.vehicles)?;
         let mut names = BTreeSet::new();
         for vehicle in &self.vehicles {
             vehicle.check(self.zenoh.enabled)?;
-            let (memory, warm_up_ms) = (&vehicle.maps.memory, self.recorder.warm_up_ms);
-            // Else each new part would change the maps: its pipeline would remember less ground.
-            let is_recorded = !self.recorder.file.as_os_str().is_empty();
-            if is_recorded && memory.enabled && (warm_up_ms as f64) < 1e3 * f64::from(GROUND_S_MAX) {
-                let allowed = format!("at least the {GROUND_S_MAX} s for which vehicle.maps.memory keeps ground");
-                return Err(ValueError::new("recorder.warm_up_ms", warm_up_ms, allowed));
-            }
             if !names.insert(&vehicle.name) {
                 return Err(ValueError::new("vehicle.name", &vehicle.name, "a different name for each vehicle"));
             }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clearway_journal::RecordedMaps;
+use clearway_mapping::memory::config::GROUND_S_MAX;
 use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
@@ -85,7 +86,8 @@ impl Default for Recorder {
 }
 
 impl Recorder {
-    pub(super) fn check(&self) -> Result<(), ValueError> {
+    /// `remembers` is true if a vehicle has a memory of ground.
+    pub(super) fn check(&self, remembers: bool) -> Result<(), ValueError> {
         let ranges = [
             ("recorder.flush_ms", self.flush_ms, 10..=60_000, "10 to 60000 ms"),
             ("recorder.part_mb", self.part_mb, 0..=1 << 20, "0 to 1048576 MiB"),
@@ -100,6 +102,11 @@ impl Recorder {
             if !allowed.contains(&value) {
                 return Err(ValueError::new(key, value, text));
             }
+        }
+        // Else each new part would change the maps: its pipeline would remember less ground.
+        if remembers && !self.file.as_os_str().is_empty() && (self.warm_up_ms as f32) < 1e3 * GROUND_S_MAX {
+            let allowed = format!("at least the {GROUND_S_MAX} s for which vehicle.maps.memory keeps ground");
+            return Err(ValueError::new("recorder.warm_up_ms", self.warm_up_ms, allowed));
         }
         Ok(())
     }

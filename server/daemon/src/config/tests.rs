@@ -187,11 +187,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         ("[[vehicle]]", "[store]\nurl = \"ftp://a/b\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
         ("[[vehicle]]", "[store]\nurl = \"s3:///prefix\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
         ("[[vehicle]]", "[store]\nurl = \"file://mnt\"\n[[vehicle]]", "file:///FOLDER"),
-        (
-            "[[vehicle]]",
-            "[recorder]\nfile = \"a\"\nwarm_up_ms = 500\n[vehicle_defaults.maps.memory]\nenabled = true\n[[vehicle]]",
-            "at least the 5 s",
-        ),
+        ("[[vehicle]]", "[recorder]\nfile = \"a\"\nwarm_up_ms = 500\n[[vehicle]]", "at least the 5 s"),
     ];
     for (from, to, allowed) in wrong {
         let error = error(&NEEDED.replacen(from, to, 1));
@@ -209,9 +205,8 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
 fn a_limit_of_a_name_without_access_is_refused() {
     let config = |names: &str| {
         let tls = "[grpc.tls]\ncertificate = \"a.pem\"\nkey = \"a.key\"\nclient_ca = \"ca.pem\"\n";
-        parse(&format!(
-            "{tls}[grpc.access]\n{names}\n[grpc.access.only]\nplanner = {{ vehicles = [\"car\"] }}\n{NEEDED}"
-        ))
+        let only = "[grpc.access.only]\nplanner = { vehicles = [\"car\"] }\n";
+        parse(&format!("{tls}[grpc.access]\n{names}\n{only}{NEEDED}"))
     };
     let refused = config("readers = [\"planer\"]").unwrap_err().to_string();
     assert!(refused.contains("grpc.access.only = planner: allowed: a name of readers"), "{refused}");

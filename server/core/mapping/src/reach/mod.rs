@@ -42,7 +42,7 @@ use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 
 use bits::Bits;
-use blind_zone::{BlindZone, is_of_ground};
+use blind_zone::BlindZone;
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
 use directions::Directions;
@@ -309,16 +309,6 @@ impl Reach {
         &self.outside
     }
 
-    /// Height that the returns of a cell's obstacle span, metres; negative without an obstacle.
-    pub(crate) fn obstacle_height_m(&self, cell: usize) -> f32 {
-        self.obstacles.height_m(cell)
-    }
-
-    /// True if no tall obstacle stands beside a cell, which is not at the border of the grid.
-    pub(crate) fn is_of_ground(&self, ix: usize, iy: usize) -> bool {
-        is_of_ground(ix, iy, |cell| self.obstacles.height_m(cell))
-    }
-
     /// By cell: lowest and highest return from the ground, millimetres, ego frame; the lowest is the larger number
     /// without one.
     pub(crate) fn ground_spans_mm(&self) -> &[[i16; 2]] {
@@ -338,9 +328,9 @@ impl Reach {
         self.obstacles.cells().for_each(|(cell, _)| cells.clear_cell(cell % SIDE, cell / SIDE));
     }
 
-    /// Lowest and highest height over the ground that the obstacle of a cell spans, metres; `None` without one.
-    pub(crate) fn obstacle_span_m(&self, cell: usize) -> Option<[f32; 2]> {
-        Some(self.obstacles.span_m(cell)).filter(|[low, high]| low <= high)
+    /// What is too high to drive over and too low to drive under.
+    pub(crate) fn obstacles(&self) -> &Obstacles {
+        &self.obstacles
     }
 
     /// The polar cell of a cell's centre.

@@ -46,10 +46,9 @@ impl Obstacles {
         self.spans_m[cell][1] - self.spans_m[cell][0]
     }
 
-    /// Lowest and highest height of a cell's returns over the ground, metres; the lowest is the larger number without
-    /// an obstacle.
-    pub fn span_m(&self, cell: usize) -> [f32; 2] {
-        self.spans_m[cell]
+    /// Lowest and highest height over the ground that the obstacle of a cell spans, metres; `None` without one.
+    pub fn span_m(&self, cell: usize) -> Option<[f32; 2]> {
+        Some(self.spans_m[cell]).filter(|[low, high]| low <= high)
     }
 
     /// The cells with an obstacle, and the heights over the ground that it spans, metres.

@@ -66,7 +66,7 @@ impl Findings<'_> {
         let spans = self.reach.ground_spans_mm();
         height.extend((0..SIDE * SIDE).map(|cell| {
             let [x, y] = centre_m(cell);
-            let of_obstacle = self.reach.obstacle_span_m(cell).map(|[_, high]| high);
+            let of_obstacle = self.reach.obstacles().span_m(cell).map(|[_, high]| high);
             let of_ground =
                 |[low, high]: [i16; 2]| (low <= high).then(|| f32::from(high) / 1000.0 - context.ground_m(x, y));
             let height_m = of_obstacle.or_else(|| of_ground(spans[cell]));
@@ -81,7 +81,7 @@ impl Findings<'_> {
         let bits = self.reach.bits();
         why.extend(class.iter().enumerate().map(|(cell, class)| {
             let is = |plane: &Bits| plane.get(cell % SIDE, cell / SIDE);
-            let obstacle = || match self.reach.obstacle_span_m(cell) {
+            let obstacle = || match self.reach.obstacles().span_m(cell) {
                 Some([low, _]) if low >= OVERHANG_M_MIN => Reason::Overhang,
                 Some(_) => Reason::Obstacle,
                 None if is(bits.closed) => Reason::Step,

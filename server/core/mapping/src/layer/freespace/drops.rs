@@ -81,7 +81,7 @@ impl Drops {
         let Self { found, beside, blind_zone, .. } = self;
         beside.clear();
         let confidences = ground.confidences();
-        blind_zone.find(found, |cell| reach.obstacle_height_m(cell), confidences, |ix, iy| beside.set(ix, iy));
+        blind_zone.find(found, |cell| reach.obstacles().height_m(cell), confidences, |ix, iy| beside.set(ix, iy));
         found.add(beside);
         found
     }

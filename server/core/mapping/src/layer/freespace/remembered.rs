@@ -16,6 +16,7 @@ use crate::layer::maker::Context;
 use crate::memory::config::GROUND_S_MAX;
 use crate::reach::Reach;
 use crate::reach::bits::Bits;
+use crate::reach::blind_zone::is_of_ground;
 use crate::reach::cells::{CELL_M, SIDE, cell, centre_m};
 
 /// Time in which maps count once, ns. Ours: a sensor's rings move by a cell's side in it at 1.25 m/s.
@@ -88,7 +89,7 @@ impl Remembered {
     fn remember(&mut self, map_from_ego: &Isometry3<f64>, reach: &Reach, found: [&Bits; KINDS], slot: i64) {
         for (kind, found) in found.into_iter().enumerate() {
             found.each(|ix, iy| {
-                if reach.is_of_ground(ix, iy) {
+                if is_of_ground(ix, iy, |cell| reach.obstacles().height_m(cell)) {
                     let new = Sightings { newest: slot, ..Sightings::default() };
                     self.cells.entry(world_cell(map_from_ego, ix, iy)).or_insert(new).found[kind] |= 1;
                 }
