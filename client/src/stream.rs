@@ -235,7 +235,7 @@ impl MapStream {
     }
 
     /// Why no map comes, worst first: the reasons of the vehicle's state on the server, or why there is no connection
-    /// ([`crate::Subscription::reconnects`]). Empty while maps come, in the first second without one, and over zenoh.
+    /// ([`crate::Subscription::reconnects`]). Empty while maps come and in the first second without one.
     pub fn reasons(&self) -> Vec<String> {
         self.slot.borrow().reasons.clone()
     }

@@ -1,5 +1,5 @@
-//! Maps over zenoh: keys `clearway/<vehicle>/map/<layer>`, the end of a replay on `clearway/<vehicle>/replay`,
-//! liveliness tokens `clearway/<vehicle>`.
+//! Maps over zenoh: keys `clearway/<vehicle>/map/<layer>`, the end of a replay on `clearway/<vehicle>/replay`, why no
+//! map comes on `clearway/<vehicle>/status`, liveliness tokens `clearway/<vehicle>`.
 //!
 //! In: the endpoints of routers or servers. Out: the same [`MapView`], [`MapStream`] and [`Ingester`] as over gRPC. It
 //! needs tokio's multi-thread runtime, because zenoh panics in a current-thread one.
@@ -31,6 +31,7 @@ use crate::view::MapView;
 
 mod query;
 mod replay;
+mod status;
 mod subscription;
 
 use query::{LayerKey, QUERY_TIMEOUT, failed};
@@ -201,10 +202,11 @@ impl ZenohClient {
         let subscription = LayerSubscription::open(&self.session, layer.clone(), slot.clone()).await;
         let subscription = subscription.map_err(failed(format!("subscribe to {key}")))?;
         let replay = replay::subscribe(&self.session, vehicle, slot.clone(), &self.endpoint).await?;
+        let status = status::subscribe(&self.session, vehicle, slot.clone()).await?;
         // A session closes with its last clone and ends its subscriptions, so the stream keeps a clone.
         let Self { session, endpoint: address, .. } = self.clone();
         Ok(MapStream::of_slot(&slot, async move {
-            let (_session, _replay) = (session, replay);
+            let _held = (session, replay, status);
             subscription.closed().await;
             ClientError::Ended { address }
         }))

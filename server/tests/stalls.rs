@@ -251,7 +251,15 @@ async fn watch_waits_for_a_server_that_is_not_there_and_again_when_it_has_ended(
         let line = lines.by_ref().take(120).map(Result::unwrap).find(|line| line.contains(part));
         assert!(line.is_some(), "watch ended before a line with {part:?}");
     };
-    says("STALE: waiting for the first map: no packets from top since the server started");
+    let why = "STALE: waiting for the first map: no packets from top since the server started";
+    says(why);
+    let mut over_zenoh = Command::new(env!("CARGO_BIN_EXE_clearway"));
+    over_zenoh.args(["watch", "--zenoh", &format!("tcp/{}", server.zenoh)]).stdout(Stdio::piped());
+    let mut over_zenoh = over_zenoh.spawn().unwrap();
+    let mut lines = BufReader::new(over_zenoh.stdout.take().unwrap()).lines().take(120).map(Result::unwrap);
+    assert!(lines.any(|line| line.contains(why)), "watch over zenoh ended before a line with the server's reason");
+    over_zenoh.kill().unwrap();
+    over_zenoh.wait().unwrap();
     server.process.kill().unwrap();
     server.process.wait().unwrap();
     says(&server.grpc.to_string());
