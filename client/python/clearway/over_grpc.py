@@ -17,7 +17,7 @@ from .limits import MAP_BYTES_MAX
 from .map import Map
 from .stream import LatestSlot, MapStream
 from .tls import Tls
-from .v1 import map_pb2, service_pb2, service_pb2_grpc
+from .v1 import Stub, map_pb2, service_pb2
 
 _OPTIONS = [
     # A server that disappears (a pulled cable) is noticed after two of these intervals.
@@ -67,7 +67,7 @@ def _led_to(error: grpc.RpcError) -> str | None:
 
 def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
     with channel(address, tls) as opened:
-        service = service_pb2_grpc.MapServiceStub(opened)
+        service = Stub(opened, "MapService")
         try:
             return list(service.ListVehicles(service_pb2.ListVehiclesRequest(), timeout=_TIMEOUT_S).vehicles)
         except grpc.RpcError as error:
@@ -90,7 +90,7 @@ def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> M
 
 def _get(address: str, request: service_pb2.GetMapRequest, tls: Tls | None) -> Map:
     with channel(address, tls) as opened:
-        service = service_pb2_grpc.MapServiceStub(opened)
+        service = Stub(opened, "MapService")
         return Map(service.GetMap(request, timeout=_TIMEOUT_S).map).with_arrival()
 
 
@@ -102,7 +102,7 @@ class _Watch:
         self.address, self.channel = address, channel(address, tls)
         self.requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
         self.requests.put(service_pb2.WatchRequest(selection=selection))
-        service = service_pb2_grpc.MapServiceStub(self.channel)
+        service = Stub(self.channel, "MapService")
         self.updates = service.Watch(iter(self.requests.get, None), wait_for_ready=waits)
 
     def close(self) -> None:

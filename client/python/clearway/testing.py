@@ -28,7 +28,7 @@ import grpc
 import clearway
 
 from .over_grpc import channel, refused
-from .v1 import replay_pb2, replay_pb2_grpc
+from .v1 import Stub, replay_pb2
 
 #: The golden recording: 0.9 s of a car with a VLP-16 in a simulated town, 10 maps.
 TOWN = Path(__file__).resolve().parent / "golden" / "town.mcap"
@@ -155,7 +155,7 @@ class Replay:
     def _call(self, request: replay_pb2.ReplayControl) -> replay_pb2.ReplayState:
         with channel(self.grpc) as opened:
             try:
-                return replay_pb2_grpc.ReplayServiceStub(opened).Control(request, timeout=PATIENCE_S)
+                return Stub(opened, "ReplayService").Control(request, timeout=PATIENCE_S)
             except grpc.RpcError as error:
                 raise refused(self.grpc, error) from None
 
