@@ -75,12 +75,12 @@ def costmap(header: map_pb2.Header, layer: Layer, inscribed_m: float) -> npt.NDA
 
 def _worst(layer: Layer) -> npt.NDArray[np.int8]:
     """For each cell 0 (free), `_UNKNOWN` or `_OCCUPIED`."""
-    by_meaning = {
+    by_meaning: dict[int, int] = {
         map_pb2.CLASS_MEANING_FREE: 0, map_pb2.CLASS_MEANING_OCCUPIED: _OCCUPIED,
         map_pb2.CLASS_MEANING_LOW: _OCCUPIED, map_pb2.CLASS_MEANING_NOT_REACHED: _OCCUPIED,
     }  # fmt: skip
     of_class = [by_meaning.get(entry.meaning, _UNKNOWN) for entry in layer.legend_entries]
-    return np.array(of_class, np.int8)[layer.classes]
+    return np.asarray(np.array(of_class, np.int8)[layer.classes])
 
 
 def _aligned(

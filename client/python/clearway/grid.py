@@ -33,7 +33,7 @@ class RadialGrid:
         """Corners of every cell, shape (rows + 1, columns + 1, 2)."""
         azimuth = np.arange(self.columns + 1) / self.columns * math.tau
         ray = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
-        return np.concatenate(([0.0], self.row_radius_m))[:, None, None] * ray + self.centre_m
+        return np.asarray(np.concatenate(([0.0], self.row_radius_m))[:, None, None] * ray + self.centre_m)
 
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
@@ -51,7 +51,7 @@ class RadialGrid:
 
         def along(share: np.ndarray) -> np.ndarray:
             ray = np.stack([np.cos(share * math.tau), np.sin(share * math.tau)], axis=-1)
-            return np.clip(ray @ (x_m, y_m), inner, outer)[:, None] * ray
+            return np.asarray(np.clip(ray @ (x_m, y_m), inner, outer)[:, None] * ray)
 
         share = math.atan2(y_m, x_m) / math.tau % 1.0
         abreast = (column <= share * self.columns) & (share * self.columns <= column + 1)
@@ -70,7 +70,7 @@ class RadialGrid:
         row, column = np.divmod(cells, self.columns)
         range_m = 0.5 * (np.concatenate(([0.0], self.row_radius_m[:-1])) + self.row_radius_m)[row]
         azimuth = (column + 0.5) / self.columns * math.tau
-        return range_m[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) + self.centre_m
+        return np.asarray(range_m[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) + self.centre_m)
 
 
 @dataclass(frozen=True)

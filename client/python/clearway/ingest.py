@@ -6,7 +6,8 @@ import queue
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import grpc
 import numpy as np
@@ -23,7 +24,8 @@ _REPORT_TIMEOUT_S = 10.0
 _REFUSALS_MAX = 4096
 
 
-class Refusal(NamedTuple):
+@dataclass(frozen=True, order=True)
+class Refusal:
     """An observation that the server refused: no map contains it."""
 
     #: Number of the observation, as `Ingester.send` returned it.

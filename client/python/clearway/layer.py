@@ -126,18 +126,18 @@ class Layer:
 
     def class_at(self, x_m: float, y_m: float) -> str:
         """Name of the class at a point (ego frame, metres); "unknown" outside the grid."""
-        cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
+        cell = int(self.grid.cells_at(np.array(x_m), np.array(y_m)))
         return "unknown" if cell < 0 else self.legend[int(self.classes.flat[cell])]
 
     def meaning_at(self, x_m: float, y_m: float) -> Meaning:
         """Meaning of the class at a point (ego frame, metres); `Meaning.UNKNOWN` outside the grid."""
-        cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
+        cell = int(self.grid.cells_at(np.array(x_m), np.array(y_m)))
         return Meaning.UNKNOWN if cell < 0 else self.legend_entries[int(self.classes.flat[cell])].meaning
 
     def value_at(self, channel: str, x_m: float, y_m: float) -> float:
         """Value of a channel at a point (ego frame, metres), in the channel's unit; NaN if nothing is known of the
         cell."""
-        cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
+        cell = int(self.grid.cells_at(np.array(x_m), np.array(y_m)))
         return math.nan if cell < 0 else float(self.channels[channel].values.flat[cell])
 
     def is_free(self, polygon: Sequence[tuple[float, float]]) -> bool:
@@ -268,7 +268,7 @@ class Layer:
         return self.channels["class"]
 
     def _means(self, meaning: Meaning) -> np.ndarray:
-        return self._of_classes(meaning)[self.classes]
+        return np.asarray(self._of_classes(meaning)[self.classes])
 
 
 def _grid(message: map_pb2.Layer) -> Grid:
@@ -304,15 +304,14 @@ def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
 def _legend(message: map_pb2.Layer, base: Layer | None) -> tuple[LegendEntry, ...]:
     """Reads the legend of a layer, or that of the base layer if a delta has none. A meaning that this version does not
     know becomes `Meaning.UNKNOWN`, so that a planner does not enter cells of that class."""
-    lists = (message.legend, message.legend_meanings, message.legend_rgb)
-    if base is not None and not any(lists):
+    names, meanings, colours = len(message.legend), len(message.legend_meanings), len(message.legend_rgb)
+    if base is not None and not names | meanings | colours:
         return base.legend_entries
-    names, meanings, colours = map(len, lists)
     if not names == meanings == colours:
         found = f"{names} names, {meanings} meanings, {colours} colours"
         text = f"layer {message.name!r}: {found}; equal numbers are needed"
         raise DecodeError("legend", text)
-    if names and message.legend_meanings[0] != Meaning.UNKNOWN:
+    if names and message.legend_meanings[0] != map_pb2.CLASS_MEANING_UNKNOWN:
         text = f"layer {message.name!r}: class 0 has the meaning {message.legend_meanings[0]}; 0 (unknown) is needed"
         raise DecodeError("legend", text)
     if names and max(message.legend_rgb) > RGB_MAX:

@@ -170,7 +170,7 @@ class Map:
     def __getstate__(self) -> dict[str, Any]:
         """Layers are pickled as they are decoded, and the age in place of the clocks, which are this process's own."""
         age = None if self._arrival is None else (self.age_ns(), self._arrival.clock.is_of_replay)
-        replaced = {"header": self.header.SerializeToString(), "_message": None, "_bases": {}, "_arrival": age}
+        replaced: dict[str, Any] = {"header": self.header.SerializeToString(), "_message": None, "_bases": {}, "_arrival": age}
         return vars(self) | {"layers": self.layers} | replaced
 
     def __setstate__(self, state: dict[str, Any]) -> None:

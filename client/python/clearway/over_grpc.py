@@ -7,7 +7,8 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import grpc
 
@@ -62,7 +63,8 @@ def refused(address: str, error: grpc.RpcError) -> ClearwayError:
 
 def _led_to(error: grpc.RpcError) -> str | None:
     """Address of the server to which this one leads: it serves the vehicle that this one does not."""
-    return next((value for key, value in error.trailing_metadata() or () if key == "clearway-served-at"), None)
+    metadata: Any = error.trailing_metadata() or ()
+    return next((value for key, value in metadata if key == "clearway-served-at"), None)
 
 
 def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
@@ -187,8 +189,9 @@ def _receive_maps(
         try:
             m = Map(update.map, base=base)
             # Maps of another run, or before a jump of a replay, were not skipped.
-            is_next = base is not None and base.header.boot_id == m.header.boot_id
-            between = m.sequence - base.sequence - 1 if is_next else 0
+            between = 0
+            if base is not None and base.header.boot_id == m.header.boot_id:
+                between = m.sequence - base.sequence - 1
             slot.store(m, max(between - left_out, 0), left_out=left_out)
             base, is_requested, left_out = m, False, 0
         except DecodeError:

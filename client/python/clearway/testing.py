@@ -155,16 +155,17 @@ class Replay:
     def _call(self, request: replay_pb2.ReplayControl) -> replay_pb2.ReplayState:
         with channel(self.grpc) as opened:
             try:
-                return Stub(opened, "ReplayService").Control(request, timeout=PATIENCE_S)
+                state: replay_pb2.ReplayState = Stub(opened, "ReplayService").Control(request, timeout=PATIENCE_S)
             except grpc.RpcError as error:
                 raise refused(self.grpc, error) from None
+        return state
 
     def _control(self, **change: Any) -> ReplayState:
         state = self._call(replay_pb2.ReplayControl(**change))
         phase = replay_pb2.ReplayPhase.Name(state.phase).removeprefix("REPLAY_PHASE_").lower()
-        seconds = [(ns - state.begin_ns) * 1e-9 for ns in (state.position_ns, state.end_ns)]
+        position_s, end_s = ((ns - state.begin_ns) * 1e-9 for ns in (state.position_ns, state.end_ns))
         maps = dict(zip(state.vehicles, state.maps))
-        return ReplayState(phase, *seconds, state.rate, state.lockstep, state.awaited, maps)
+        return ReplayState(phase, position_s, end_s, state.rate, state.lockstep, state.awaited, maps)
 
     def close(self) -> None:
         """Stops the server as a crash would: without a word to its readers."""
