@@ -17,7 +17,7 @@ from .costmap import OccupancyGrid, costmap, occupancy_grid
 from .errors import ClearwayError, DecodeError
 from .freshness import Arrival, Clock, now_ns
 from .layer import Layer
-from .limits import MAP_BYTES_MAX, MAP_CELLS_MAX
+from .limits import MAP_BYTES_MAX, MAP_CELLS_MAX, WIRE_VERSION
 from .v1 import map_pb2
 
 #: Longest time after its capture for which a map is believed to be valid (the Rust client's view.rs).
@@ -203,6 +203,9 @@ def _base(message: map_pb2.Map, layer: map_pb2.Layer, base: Map | None) -> Layer
 
 def _check_header(message: map_pb2.Map) -> None:
     header = message.header
+    if header.wire_version > WIRE_VERSION:
+        text = f"wire of version {header.wire_version}; this reader knows versions up to {WIRE_VERSION}"
+        raise DecodeError("version", text)
     if not message.HasField("header") or header.capture_start_ns > header.capture_end_ns:
         raise DecodeError("header", "the header is absent, or its capture starts after its end")
     if header.HasField("map_from_ego"):

@@ -58,6 +58,7 @@ test("the limits are those of the golden file", () => {
   assert.equal(limits.MAP_CELLS_MAX, map_cells_max);
   assert.equal(limits.MAP_BYTES_MAX, map_bytes_max);
   assert.equal(limits.MAP_PARTS_MAX, map_parts_max);
+  assert.equal(limits.WIRE_VERSION, others.wire_version);
   assert.equal(limits.SAFE_POINT_STEPS_MAX, others.safe_point_steps_max);
 });
 

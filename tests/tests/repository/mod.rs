@@ -5,6 +5,7 @@ mod modules;
 mod ratchet;
 mod readme;
 mod tidy;
+mod wire;
 
 use std::fs;
 use std::path::{Path, PathBuf};

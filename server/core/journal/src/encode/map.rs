@@ -204,6 +204,8 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
             .map_or(String::new(), |sensor| sensor.name.to_string()),
         epoch: map.epoch,
         replay: None,
+        // Absent: version 1.
+        wire_version: 0,
     }
 }
 
