@@ -2,6 +2,7 @@
 
 mod kit;
 mod modules;
+mod packages;
 mod ratchet;
 mod readme;
 mod tidy;
