@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use crate::fixture::venv;
 
 /// The descriptors of the wire as it landed last: what a change may not break.
-const LANDED: &str = "landed.binpb";
+const LANDED: &str = "golden/landed.binpb";
 
 /// `buf`, installed below the target directory.
 fn buf() -> PathBuf {
