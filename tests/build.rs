@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `clearway_data` | recorded drives with an `INDEX.md`: `$CLEARWAY_DATA`, else `shared/data` beside the repository |
 //! | `clearway_python` | `python3` with the modules `venv` and `ensurepip` |
+//! | `clearway_npm` | `npm`, which installs `buf` |
 //! | `clearway_cpp` | a compiler of C++, `c++` |
 //! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
 //! | `clearway_deploy` | the tools that lint and start `deploy/`: those of [`DEPLOY`], as root |
@@ -55,9 +56,12 @@ fn main() {
     if let Some(data) = &data {
         println!("cargo::rerun-if-changed={}", data.join("INDEX.md").display());
     }
+    // A published crate looks for nothing on the machine of its user.
+    let succeeds = |program: &str, arguments: &[&str]| repository.is_some() && succeeds(program, arguments);
     set("clearway_data", data.is_some());
     println!("cargo::rustc-env=CLEARWAY_DRIVES={}", data.unwrap_or_default().display());
     set("clearway_python", succeeds("python3", &["-c", "import venv, ensurepip"]));
+    set("clearway_npm", succeeds("npm", &["--version"]));
     set("clearway_cpp", succeeds("c++", &["--version"]));
     set("clearway_openssl", succeeds("openssl", &["version"]));
     set("clearway_promtool", succeeds("promtool", &["--version"]));

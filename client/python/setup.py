@@ -1,4 +1,5 @@
-"""Compiles the wire contract, proto/clearway/v1, into clearway/v1 of what is built, and adds the golden recording.
+"""Compiles the wire contract, proto/clearway/v1, into descriptors and types in clearway/v1 of what is built, and adds
+the golden recording.
 
 In a checkout both lie outside this folder, in a source distribution in it: the distribution carries copies. Nothing
 generated lies in the tree.
@@ -25,18 +26,17 @@ def copy(source: Path, to: Path) -> None:
 
 
 class BuildWithMessages(build_py):
-    """`build_py`, the generated messages and the golden recording."""
+    """`build_py`, the messages and the golden recording."""
 
     def run(self) -> None:
         from grpc_tools import protoc
 
         super().run()
         out = Path(self.build_lib)
-        (out / "clearway" / "v1").mkdir(parents=True, exist_ok=True)
-        arguments = ["protoc", f"-I{PROTO}", f"--python_out={out}", f"--pyi_out={out}", f"--grpc_python_out={out}"]
+        stored = out / "clearway" / "v1" / "descriptors.binpb"
+        arguments = ["protoc", f"-I{PROTO}", f"--descriptor_set_out={stored}", f"--pyi_out={out}"]
         if not MESSAGES or protoc.main(arguments + MESSAGES) != 0:
             raise SystemExit(f"no messages could be made of {PROTO}/clearway/v1: build from a whole checkout")
-        (out / "clearway" / "v1" / "__init__.py").write_text('"""The messages of proto/clearway/v1."""\n')
         copy(RECORDING, out / "clearway" / "golden" / RECORDING.name)
 
 

@@ -17,9 +17,11 @@ pub const NUMBER_BITS_MAX: u32 = 32;
 pub const SAFE_POINT_STEPS_MAX: i64 = 1 << 24;
 /// Greatest colour of a class: 0xRRGGBB.
 pub const RGB_MAX: u32 = 0x00ff_ffff;
+/// Latest major version of the wire that is read; 0 and 1 are the first one.
+pub const WIRE_VERSION: u32 = 1;
 
 /// Name and value of each limit, as in `golden/limits.json`.
-pub const TABLE: [(&str, u64); 7] = [
+pub const TABLE: [(&str, u64); 8] = [
     ("channel_cells_max", CHANNEL_CELLS_MAX as u64),
     ("map_cells_max", MAP_CELLS_MAX),
     ("map_bytes_max", MAP_BYTES_MAX as u64),
@@ -27,6 +29,7 @@ pub const TABLE: [(&str, u64); 7] = [
     ("number_bits_max", NUMBER_BITS_MAX as u64),
     ("safe_point_steps_max", SAFE_POINT_STEPS_MAX as u64),
     ("rgb_max", RGB_MAX as u64),
+    ("wire_version", WIRE_VERSION as u64),
 ];
 
 /// The limits that a reader may lower. The default is the table's values.

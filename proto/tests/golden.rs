@@ -369,7 +369,7 @@ fn the_golden_map_is_its_header_and_its_layers_concatenated() {
 /// (name, expected error, fault to inject into the golden map).
 type Fault = (&'static str, &'static str, fn(&mut v1::Map));
 
-fn faults() -> [Fault; 42] {
+fn faults() -> [Fault; 43] {
     [
         ("class_table_too_short", "by_class", |map| map.layers[0].channels[1].by_class = vec![1; 3].into()),
         ("class_table_on_channel_class", "by_class", |map| map.layers[0].channels[0].by_class = vec![0; 4].into()),
@@ -418,6 +418,7 @@ fn faults() -> [Fault; 42] {
         ("safe_points_linked_twice", "safe_point", |map| points(map).link_back[2] = 3),
         ("safe_links_of_two_lengths", "safe_point", |map| points(map).link_back.truncate(2)),
         ("wrong_crc", "cells", |map| map.layers[0].channels[0].crc32 ^= 1),
+        ("wire_of_version_2", "version", |map| map.header.as_mut().unwrap().wire_version = 2),
     ]
 }
 

@@ -13,11 +13,15 @@ from collections.abc import Sequence
 from os import PathLike
 
 from . import over_grpc, over_zenoh
+from .costmap import OccupancyGrid
 from .errors import ClearwayError, DecodeError, ReplayEnded
 from .freshness import now_ns
 from .grid import CartesianGrid, RadialGrid
-from .map import Channel, Layer, LegendEntry, Map, Meaning, SafePoint
+from .ingest import Ingester, Refusal
+from .layer import Channel, Layer, LegendEntry, Meaning, SafePoint
+from .map import Map
 from .questions import Along, Answer, Blocker, Obstacle
+from .recorder import Recorder
 from .recording import read
 from .shapes import Arc, Outline
 from .stream import MapStream, PassedOver
@@ -25,9 +29,10 @@ from .tls import Tls
 from .v1 import map_pb2, service_pb2
 
 __all__ = [
-    "Along", "Answer", "Arc", "Blocker", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer",
-    "LegendEntry", "Map", "MapStream", "Meaning", "Obstacle", "Outline", "PassedOver", "RadialGrid", "SafePoint", "Tls",
-    "get", "now_ns", "read", "vehicles", "watch",
+    "Along", "Answer", "Arc", "Blocker", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Ingester",
+    "Layer", "LegendEntry", "Map", "MapStream", "Meaning", "Obstacle", "OccupancyGrid", "Outline", "PassedOver",
+    "RadialGrid", "Recorder", "Refusal", "ReplayEnded", "SafePoint", "Tls", "get", "now_ns", "read", "status",
+    "vehicles", "watch",
 ]  # fmt: skip
 
 
@@ -94,6 +99,17 @@ def vehicles(address: str, tls: Tls | None = None) -> list[str]:
     if address.startswith("zenoh:"):
         return over_zenoh.vehicles(address.removeprefix("zenoh:"), tls)
     return sorted(vehicle.name for vehicle in over_grpc.vehicles(address, tls))
+
+
+def status(address: str, vehicle: str = "", tls: Tls | None = None) -> service_pb2.Vehicle:
+    """Returns the state of a vehicle, over gRPC: the message `Vehicle` of service.proto, in which each field is
+    described. `state` is "ok", "warn" or "error", and `reasons` say why. `vehicle` may be empty if there is one."""
+    found = over_grpc.vehicles(address, tls)
+    fit = [one for one in found if vehicle in ("", one.name)]
+    if len(fit) != 1:
+        known = ", ".join(one.name for one in found) or "none"
+        raise ClearwayError("vehicle", f"{address}: {len(fit)} vehicles fit {vehicle!r}; the server has {known}")
+    return fit[0]
 
 
 def _names(layers: str | Sequence[str]) -> Sequence[str]:

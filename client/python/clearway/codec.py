@@ -16,7 +16,7 @@ from .errors import DecodeError
 from .limits import CHANNEL_CELLS_MAX, NUMBER_BITS_MAX
 from .v1 import map_pb2
 
-_TYPES = {1: np.dtype("u1"), 2: np.dtype("i1"), 3: np.dtype("<u2")}
+_TYPES: dict[int, np.dtype] = {1: np.dtype("u1"), 2: np.dtype("i1"), 3: np.dtype("<u2")}
 _RAW, _ROWS, _CHANGES = map_pb2.ENCODING_RAW, map_pb2.ENCODING_ROWS, map_pb2.ENCODING_CHANGES
 # Claims of more cells for each byte of the payload are checked before memory is allocated for them.
 _CELLS_PER_BYTE = 1024
@@ -26,12 +26,13 @@ _BUSY = re.compile(rb"[^\0]")
 def decode(channel: map_pb2.Channel, columns: int, base: Callable[[np.dtype], np.ndarray] | None = None) -> np.ndarray:
     """Returns the cells, shape (rows, columns). `base` makes the base of changes for a type of cells; it is called
     after the counts are checked."""
-    count, payload, dtype = channel.cell_count, channel.payload, _TYPES.get(channel.cell_type)
+    count, payload = channel.cell_count, channel.payload
+    dtype = _TYPES.get(channel.cell_type)
     if count > CHANNEL_CELLS_MAX:
         raise DecodeError("too_many_cells", f"{count} cells; at most {CHANNEL_CELLS_MAX} are allowed")
     spare = count * dtype.itemsize - len(payload) if dtype else -1
     fits = {_RAW: spare == 0, _ROWS: spare > 0, _CHANGES: spare > 0 and base is not None}
-    if not fits.get(channel.encoding):
+    if dtype is None or not fits.get(channel.encoding):
         raise DecodeError("cells", f"{len(payload)} bytes of encoding {channel.encoding} for {count} {dtype} cells")
     if channel.encoding == _RAW:
         cells = np.frombuffer(payload, dtype).reshape(-1, columns)
@@ -39,7 +40,7 @@ def decode(channel: map_pb2.Channel, columns: int, base: Callable[[np.dtype], np
         if count > _CELLS_PER_BYTE * (len(payload) + 64):
             _check_lengths(_Bits(payload, dtype), count)
         cells = _rows(_Bits(payload, dtype), count // columns, columns, dtype)
-    else:
+    elif base is not None:
         cells = _changes(_Bits(payload, dtype), base(dtype))
     if zlib.crc32(cells.tobytes()) != channel.crc32:
         raise DecodeError("cells", f"CRC-32 of the cells is not {channel.crc32:08x}, as the channel states")
@@ -73,7 +74,9 @@ class _Bits:
         return number
 
     def cell(self, number: int) -> np.generic:
-        return np.int64(number >> 1 ^ -(number & 1) if self.dtype.kind == "i" else number).astype(self.dtype)
+        signed = number >> 1 ^ -(number & 1) if self.dtype.kind == "i" else number
+        cell: np.generic = np.int64(signed).astype(self.dtype)
+        return cell
 
 
 def _check_lengths(bits: _Bits, count: int) -> None:
@@ -108,9 +111,9 @@ def _changes(bits: _Bits, base: np.ndarray) -> np.ndarray:
     runs: dict[int, tuple[bool, int]] = {}
 
     def read_flag(context: int) -> bool:
-        changed, left = runs.get(context, (None, 0))
+        changed, left = runs.get(context, (False, 0))
         if not left:
-            changed = bits.bit() if changed is None else not changed
+            changed = not changed if context in runs else bits.bit()
             left = bits.adaptive((context, changed)) + 1
         runs[context] = changed, left - 1
         return changed
@@ -125,7 +128,8 @@ def _changes(bits: _Bits, base: np.ndarray) -> np.ndarray:
         step, (changed, left) = 1, runs.get(0, (True, 0))
         if not contexts[at] and left and not changed:
             # Unchanged cells of context 0 are skipped together.
-            step = min(_BUSY.search(contexts, at).start() - at, left)
+            busy = _BUSY.search(contexts, at)
+            step = min((busy.start() if busy else base.size) - at, left)
             runs[0] = changed, left - step
         elif read_flag(contexts[at]):
             here = (at // columns + 1) * width + at % columns + 1
@@ -143,7 +147,8 @@ def by_class(channel: map_pb2.Channel, classes: np.ndarray, legend: int, dtype: 
     classes."""
     if classes.dtype != np.uint8 or len(channel.by_class) != legend * dtype.itemsize or (classes >= legend).any():
         raise DecodeError("by_class", f"channel {channel.name!r}: {len(channel.by_class)} bytes, {legend} classes")
-    return np.frombuffer(channel.by_class, dtype)[classes]
+    table: np.ndarray = np.frombuffer(channel.by_class, dtype)
+    return np.asarray(table[classes])
 
 
 def shifted(before: np.ndarray, shape: tuple[int, int], by: tuple[int, int], unknown: int) -> np.ndarray:

@@ -25,6 +25,16 @@ class RadialGrid:
     def shape(self) -> tuple[int, int]:
         return len(self.row_radius_m), self.columns
 
+    def __str__(self) -> str:
+        range_m = self.row_radius_m[-1]
+        return f"{len(self.row_radius_m)} rings to {range_m:.1f} m of {self.columns} sectors"
+
+    def corners(self) -> np.ndarray:
+        """Corners of every cell, shape (rows + 1, columns + 1, 2)."""
+        azimuth = np.arange(self.columns + 1) / self.columns * math.tau
+        ray = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+        return np.asarray(np.concatenate(([0.0], self.row_radius_m))[:, None, None] * ray + self.centre_m)
+
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
         x_m, y_m = np.asarray(x_m) - self.centre_m[0], np.asarray(y_m) - self.centre_m[1]
@@ -41,7 +51,7 @@ class RadialGrid:
 
         def along(share: np.ndarray) -> np.ndarray:
             ray = np.stack([np.cos(share * math.tau), np.sin(share * math.tau)], axis=-1)
-            return np.clip(ray @ (x_m, y_m), inner, outer)[:, None] * ray
+            return np.asarray(np.clip(ray @ (x_m, y_m), inner, outer)[:, None] * ray)
 
         share = math.atan2(y_m, x_m) / math.tau % 1.0
         abreast = (column <= share * self.columns) & (share * self.columns <= column + 1)
@@ -60,7 +70,7 @@ class RadialGrid:
         row, column = np.divmod(cells, self.columns)
         range_m = 0.5 * (np.concatenate(([0.0], self.row_radius_m[:-1])) + self.row_radius_m)[row]
         azimuth = (column + 0.5) / self.columns * math.tau
-        return range_m[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) + self.centre_m
+        return np.asarray(range_m[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) + self.centre_m)
 
 
 @dataclass(frozen=True)
@@ -86,6 +96,14 @@ class CartesianGrid:
     def shape(self) -> tuple[int, int]:
         return self.height, self.width
 
+    def __str__(self) -> str:
+        return f"{self.width} x {self.height} cells of {self.cell_m:.3g} m"
+
+    def corners(self) -> np.ndarray:
+        """Corners of every cell in the ego frame, shape (height + 1, width + 1, 2)."""
+        iy, ix = np.mgrid[: self.height + 1, : self.width + 1]
+        return self._placed(ix, iy)
+
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
@@ -110,7 +128,11 @@ class CartesianGrid:
     def centres_of(self, cells: np.ndarray) -> np.ndarray:
         """Centre of each of these cells (indices) in the ego frame, shape (n, 2)."""
         iy, ix = np.divmod(cells, self.width)
-        x, y = self.origin_x_m + (ix + 0.5) * self.cell_m, self.origin_y_m + (iy + 0.5) * self.cell_m
+        return self._placed(ix + 0.5, iy + 0.5)
+
+    def _placed(self, ix: np.ndarray, iy: np.ndarray) -> np.ndarray:
+        """Points of the ego frame, from numbers of cells along the grid's axes."""
+        x, y = self.origin_x_m + ix * self.cell_m, self.origin_y_m + iy * self.cell_m
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
 

@@ -17,3 +17,5 @@ NUMBER_BITS_MAX = 32
 SAFE_POINT_STEPS_MAX = 1 << 24
 #: Greatest colour of a class: 0xRRGGBB.
 RGB_MAX = 0xFFFFFF
+#: Latest major version of the wire that is read; 0 and 1 are the first one.
+WIRE_VERSION = 1

@@ -7,7 +7,8 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import grpc
 
@@ -17,7 +18,7 @@ from .limits import MAP_BYTES_MAX
 from .map import Map
 from .stream import LatestSlot, MapStream
 from .tls import Tls
-from .v1 import map_pb2, service_pb2, service_pb2_grpc
+from .v1 import Stub, map_pb2, service_pb2
 
 _OPTIONS = [
     # A server that disappears (a pulled cable) is noticed after two of these intervals.
@@ -62,12 +63,13 @@ def refused(address: str, error: grpc.RpcError) -> ClearwayError:
 
 def _led_to(error: grpc.RpcError) -> str | None:
     """Address of the server to which this one leads: it serves the vehicle that this one does not."""
-    return next((value for key, value in error.trailing_metadata() or () if key == "clearway-served-at"), None)
+    metadata: Any = error.trailing_metadata() or ()
+    return next((value for key, value in metadata if key == "clearway-served-at"), None)
 
 
 def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
     with channel(address, tls) as opened:
-        service = service_pb2_grpc.MapServiceStub(opened)
+        service = Stub(opened, "MapService")
         try:
             return list(service.ListVehicles(service_pb2.ListVehiclesRequest(), timeout=_TIMEOUT_S).vehicles)
         except grpc.RpcError as error:
@@ -90,7 +92,7 @@ def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> M
 
 def _get(address: str, request: service_pb2.GetMapRequest, tls: Tls | None) -> Map:
     with channel(address, tls) as opened:
-        service = service_pb2_grpc.MapServiceStub(opened)
+        service = Stub(opened, "MapService")
         return Map(service.GetMap(request, timeout=_TIMEOUT_S).map).with_arrival()
 
 
@@ -102,7 +104,7 @@ class _Watch:
         self.address, self.channel = address, channel(address, tls)
         self.requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
         self.requests.put(service_pb2.WatchRequest(selection=selection))
-        service = service_pb2_grpc.MapServiceStub(self.channel)
+        service = Stub(self.channel, "MapService")
         self.updates = service.Watch(iter(self.requests.get, None), wait_for_ready=waits)
 
     def close(self) -> None:
@@ -187,8 +189,9 @@ def _receive_maps(
         try:
             m = Map(update.map, base=base)
             # Maps of another run, or before a jump of a replay, were not skipped.
-            is_next = base is not None and base.header.boot_id == m.header.boot_id
-            between = m.sequence - base.sequence - 1 if is_next else 0
+            between = 0
+            if base is not None and base.header.boot_id == m.header.boot_id:
+                between = m.sequence - base.sequence - 1
             slot.store(m, max(between - left_out, 0), left_out=left_out)
             base, is_requested, left_out = m, False, 0
         except DecodeError:

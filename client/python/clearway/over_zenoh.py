@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .errors import ClearwayError, forked
 from .map import Map
@@ -66,7 +66,7 @@ def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
     except ImportError:
         raise ClearwayError("zenoh", "zenoh is not installed: pip install 'clearway[zenoh]'") from None
     _check_not_forked()
-    encrypted = {"so_rcvbuf": 262144}
+    encrypted: dict[str, Any] = {"so_rcvbuf": 262144}
     endpoints = endpoint.split("+" if "+" in endpoint else ",")
     if tls is not None:
         if not all(one.startswith("tls/") for one in endpoints):
@@ -110,8 +110,8 @@ def _replies(session: zenoh.Session, key: str) -> Iterator[zenoh.Sample]:
     """Every reply of every peer: zenoh would otherwise select one, perhaps that of a peer that is no server."""
     import zenoh
 
-    everything = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
-    for reply in session.get(key, timeout=_TIMEOUT_S, **everything):
+    every, none = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
+    for reply in session.get(key, timeout=_TIMEOUT_S, target=every, consolidation=none):
         if reply.ok:
             yield reply.ok
 
@@ -180,7 +180,7 @@ def watch(
     threads: list[threading.Thread] = []
 
     def close() -> None:
-        session.close()
+        session.close()  # type: ignore[no-untyped-call]
         # The garbage collector may call this from one of them.
         for thread in threads:
             if thread is not threading.current_thread():

@@ -10,8 +10,8 @@ own. The Rust client gives the same answers (`client/golden/questions.json`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from .shapes import Arc, Outline, Point, corners_of, finite, length, poses_of
 
 #: Distance in metres below which a point touches a cell: far more than the rounding errors of a point on a map.
 _TOUCH_M = 1e-9
+#: One number for all stretches of a line, or one for each.
+Numbers = float | np.ndarray
 #: What a class is to a vehicle that drives onto it.
 FREE, LOW, BLOCKS = 0, 1, 2
 #: Names of the values of the channel `why` of the layer `freespace`.
@@ -89,13 +91,14 @@ class Asked:
     def along(self, path: Arc | Sequence[Point], outline: Outline) -> Along:
         outline.check()
         poses = poses_of(path)
-        low = None
+        low: tuple[float, Blocker] | None = None
         for pose in poses:
             answer = self._answer(outline.at(pose.place, pose.heading_rad), pose.place)
+            if answer.blocker is None:
+                continue
             if answer.verdict == "blocked":
                 return Along(poses[-1].along_m, low, (pose.along_m, answer.blocker))
-            if answer.verdict == "low" and low is None:
-                low = pose.along_m, answer.blocker
+            low = low or (pose.along_m, answer.blocker)
         return Along(poses[-1].along_m, low, None)
 
     def nearest(self, wanted: np.ndarray, x_m: float, y_m: float, own: Outline | None) -> Obstacle | None:
@@ -112,7 +115,8 @@ class Asked:
         distances = np.hypot(places[:, 0] - x_m, places[:, 1] - y_m)
         nearest = int(distances.argmin())
         name = self._names[self._classes[cells[nearest]]]
-        return Obstacle(*map(float, places[nearest]), float(distances[nearest]), name)
+        x_m, y_m = places[nearest].tolist()
+        return Obstacle(x_m, y_m, float(distances[nearest]), name)
 
     def clearance(self, most_m: float, passes_low: bool) -> np.ndarray:
         most_m = length("most_m", most_m)
@@ -125,7 +129,7 @@ class Asked:
         down = _steps_down(free, reach)
         squared = np.full((height, width), np.iinfo(np.int64).max)
         for by in range(min(reach, width) + 1):
-            away = _halves(by)
+            away = _halves(np.int64(by))
             padded = np.zeros((height, width + 2 * by), dtype=np.int64)
             padded[:, by : by + width] = _halves(down)
             for shifted in (padded[:, :width], padded[:, 2 * by :]):
@@ -149,7 +153,8 @@ class Asked:
         micrometres = np.floor(np.hypot(centres[:, 0] - start[0], centres[:, 1] - start[1]) * 1e6 + 0.5)
         first = int(micrometres.argmin())
         cell = int(cells[first])
-        return Blocker(*map(float, centres[first]), self._names[self._classes[cell]], self._reason(cell))
+        x_m, y_m = centres[first].tolist()
+        return Blocker(x_m, y_m, self._names[self._classes[cell]], self._reason(cell))
 
     def _reason(self, cell: int) -> str | None:
         if self._why is None:
@@ -193,7 +198,9 @@ class _Spans:
         """True for each cell of each line that is touched."""
         return self._borders.cumsum(axis=1)[:, :-1] > 0
 
-    def add_pairs(self, lines: np.ndarray, places: np.ndarray, to_cell) -> None:
+    def add_pairs(
+        self, lines: np.ndarray, places: np.ndarray, to_cell: Callable[[np.ndarray], np.ndarray]
+    ) -> None:
         """Adds the stretch from the first to the second of each pair of a line's places in their order."""
         order = np.lexsort((places, lines))
         lines, places = lines[order], places[order]
@@ -220,7 +227,8 @@ def _touched_squares(grid: CartesianGrid, corners: np.ndarray) -> tuple[np.ndarr
         if len(crossed):
             crossings.append((crossed - start, a[0] + (crossed + 0.5 - a[1]) / (b[1] - a[1]) * (b[0] - a[0])))
     if crossings:
-        spans.add_pairs(*map(np.concatenate, zip(*crossings)), np.floor)
+        lines, places = map(np.concatenate, zip(*crossings))
+        spans.add_pairs(lines, places, np.floor)
     cells = start * grid.width + np.flatnonzero(spans.mask())
     return cells, spans.is_outside or first < 0 or last >= grid.height
 
@@ -263,7 +271,9 @@ def _repeated(a: np.ndarray, b: np.ndarray, count: int) -> tuple[np.ndarray, np.
     return np.tile(a, (count, 1)), np.tile(b, (count, 1))
 
 
-def _clip(a: np.ndarray, b: np.ndarray, nx, ny, offset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _clip(
+    a: np.ndarray, b: np.ndarray, nx: Numbers, ny: Numbers, offset: Numbers
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The parts of stretches where n . p >= offset, and which of them there are."""
     # A border that is not finite belongs to a stretch that is left out.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -278,10 +288,11 @@ def _nearest_to_origin(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     squared = (d * d).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(squared > 0.0, np.clip(-(a * d).sum(axis=1) / squared, 0.0, 1.0), 0.0)
-    return a + share[:, None] * d
+    nearest: np.ndarray = a + share[:, None] * d
+    return nearest
 
 
-def _halves(steps):
+def _halves(steps: Any) -> Any:
     """Square of the half cells between a cell's centre and the nearest edge of the cell `steps` further on."""
     halves = np.maximum(2 * steps - 1, 0)
     return halves * halves

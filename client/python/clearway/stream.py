@@ -6,11 +6,13 @@ map. A waiting reader is notified when its map becomes stale, also if no further
 
 from __future__ import annotations
 
+import asyncio
 import os
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 from .errors import ClearwayError, ReplayEnded, forked
@@ -52,6 +54,13 @@ _SKIPPED_MAX_PER_MS, _SKIPPED_MAX = 1, 1000
 _AFTER_END_S = 2.0
 
 
+class _Closed(ClearwayError):
+    """The reader has closed the stream."""
+
+    def __init__(self) -> None:
+        super().__init__("closed", "the stream is closed")
+
+
 class MapStream:
     """An iterator over the newest map; it stops at the end of a replay, and has no end otherwise. Close it, or use it
     in a `with` statement; a stream that is dropped, or open at the end of the process, is closed."""
@@ -78,7 +87,7 @@ class MapStream:
         for the maps of a replay that is set back: it waits 2 s for them, and then stops again."""
         try:
             return self._slot.next(report_stale=False)
-        except ReplayEnded:
+        except (ReplayEnded, _Closed):
             raise StopIteration from None
 
     def next_or_stale(self) -> Map:
@@ -86,10 +95,21 @@ class MapStream:
         once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. Raises the reason if the
         stream has ended: `ReplayEnded` at the end of a replay, as an iteration stops there, `ClearwayError` of reason
         "closed" when closed."""
+        return self._slot.next(report_stale=True)
+
+    def __aiter__(self) -> MapStream:
+        return self
+
+    async def __anext__(self) -> Map:
+        """As `__next__`, without blocking the event loop. A wait that is cancelled takes no map."""
         try:
-            return self._slot.next(report_stale=True)
-        except StopIteration:
-            raise ClearwayError("closed", "the stream is closed") from None
+            return await self._slot.next_async(report_stale=False)
+        except (ReplayEnded, _Closed):
+            raise StopAsyncIteration from None
+
+    async def anext_or_stale(self) -> Map:
+        """As `next_or_stale`, without blocking the event loop."""
+        return await self._slot.next_async(report_stale=True)
 
     def newest(self) -> Map | None:
         """The newest map at this moment; `None` before the first. It does not wait and does not change the counts of
@@ -105,6 +125,12 @@ class MapStream:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    async def __aenter__(self) -> MapStream:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await asyncio.to_thread(self.close)
 
     @property
     def passed_over(self) -> PassedOver:
@@ -128,6 +154,8 @@ class LatestSlot:
         #: True if all maps come from one server that is known: another run is then a jump of its replay.
         self._has_one_server = has_one_server
         self._changed = threading.Condition()
+        #: Functions that wake the coroutines that wait.
+        self._wakers: list[Callable[[], None]] = []
         self._newest: Map | None = None
         self._counters = _Counters()
         self._passed_over = PassedOver()
@@ -174,42 +202,92 @@ class LatestSlot:
         """Ends every wait for a map."""
         with self._changed:
             self._closed = True
-            self._changed.notify_all()
+            self._notify()
 
     def next(self, *, report_stale: bool) -> Map:
         """Waits as `MapStream.next_or_stale` does, or as `MapStream.__next__`. For the reader."""
+        self._check_not_forked()
+        with self._changed:
+            until = self._ask()
+            while (found := self._found(until, report_stale)) is None:
+                self._changed.wait(self._pause_s(report_stale))
+            return found
+
+    async def next_async(self, *, report_stale: bool) -> Map:
+        """As `next`, in a coroutine."""
+        loop, changed = asyncio.get_running_loop(), asyncio.Event()
+
+        def wake() -> None:
+            # The loop may be closed with a coroutine that still waits.
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(changed.set)
+
+        self._check_not_forked()
+        with self._changed:
+            until = self._ask()
+            self._wakers.append(wake)
+        try:
+            while True:
+                changed.clear()
+                with self._changed:
+                    if (found := self._found(until, report_stale)) is not None:
+                        return found
+                    timer = loop.call_later(self._pause_s(report_stale), changed.set)
+                try:
+                    await changed.wait()
+                finally:
+                    timer.cancel()
+        finally:
+            with self._changed:
+                self._wakers.remove(wake)
+
+    def _check_not_forked(self) -> None:
         if os.getpid() != self._process:
             raise forked("the stream")
-        with self._changed:
-            self._handled = self._seen
-            self._changed.notify_all()
-            until = time.monotonic() + _AFTER_END_S
-            while not (self._closed or self._is_unseen() or self._ended or self.replay_ended):
-                if self._at_end and time.monotonic() >= until:
-                    raise ReplayEnded
-                last = self._fresh if report_stale else None
-                if last is not None and last.stale:
-                    self._fresh = None
-                    return last.copy_with()
-                # On some platforms Ctrl-C does not interrupt a wait without limit.
-                self._changed.wait(1.0 if last is None else min(POLL_INTERVAL_S, last.fresh_for_s()))
-            if self._closed:
-                raise StopIteration
-            newest = self._newest
-            if self.replay_ended and not self._is_unseen():
+
+    def _ask(self) -> float:
+        """The reader asks for the next map: it has handled the last. Returns until when it waits after a replay."""
+        self._handled = self._seen
+        self._notify()
+        return time.monotonic() + _AFTER_END_S
+
+    def _pause_s(self, report_stale: bool) -> float:
+        """Longest time until the next look. On some platforms Ctrl-C does not interrupt a wait without limit."""
+        last = self._fresh if report_stale else None
+        return 1.0 if last is None else min(POLL_INTERVAL_S, last.fresh_for_s())
+
+    def _found(self, until: float, report_stale: bool) -> Map | None:
+        """What the reader waits for; `None` if it must wait."""
+        if self._closed:
+            raise _Closed
+        newest = self._newest
+        if newest is None or not self._is_unseen():
+            if self.replay_ended:
                 self._replay_ends_seen = self._replay_ends
                 raise ReplayEnded
-            if newest is None or not self._is_unseen():
-                assert self._ended is not None
+            if self._ended:
                 raise self._ended
-            # The first map has skipped nothing: the reader was not subscribed before.
-            counters, before = self._counters, self._seen or self._counters._replace(maps=self._counters.maps - 1)
-            self._seen = counters
-            last = newest.copy_with(
-                counters.maps - before.maps - 1, counters.lost - before.lost, counters.left_out - before.left_out
-            )
-            self._fresh = None if last.stale else last
-            return last
+            if self._at_end and time.monotonic() >= until:
+                raise ReplayEnded
+            last = self._fresh if report_stale else None
+            if last is None or not last.stale:
+                return None
+            self._fresh = None
+            return last.copy_with()
+        # The first map has skipped nothing: the reader was not subscribed before.
+        counters, before = self._counters, self._seen or self._counters._replace(maps=self._counters.maps - 1)
+        self._seen = counters
+        last = newest.copy_with(
+            counters.maps - before.maps - 1, counters.lost - before.lost, counters.left_out - before.left_out
+        )
+        self._fresh = None if last.stale else last
+        return last
+
+    def _notify(self) -> None:
+        """Wakes every wait. The lock is held."""
+        self._changed.notify_all()
+        for wake in self._wakers:
+            wake()
 
     @property
     def replay_ended(self) -> bool:
@@ -236,7 +314,7 @@ class LatestSlot:
             before = self._counters
             self._counters = _Counters(before.maps + 1 + skipped, before.lost + lost, before.left_out + left_out)
             self._newest, self._at_end, self._reasons = m, False, []
-            self._changed.notify_all()
+            self._notify()
             return True
 
     def pass_over(self, reason: str) -> None:
@@ -251,7 +329,7 @@ class LatestSlot:
         """Ends the stream with a reason. For the background thread."""
         with self._changed:
             self._ended = reason
-            self._changed.notify_all()
+            self._notify()
 
     def wait_until_handled(self) -> None:
         """Waits until the reader has handled the newest map: until it asks for the next. For the background thread."""
@@ -265,7 +343,7 @@ class LatestSlot:
         with self._changed:
             self._replay_ends += 1
             self._at_end = True
-            self._changed.notify_all()
+            self._notify()
 
 
 def _refuse(newest: Map, m: Map) -> str | None:

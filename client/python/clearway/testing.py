@@ -28,7 +28,7 @@ import grpc
 import clearway
 
 from .over_grpc import channel, refused
-from .v1 import replay_pb2, replay_pb2_grpc
+from .v1 import Stub, replay_pb2
 
 #: The golden recording: 0.9 s of a car with a VLP-16 in a simulated town, 10 maps.
 TOWN = Path(__file__).resolve().parent / "golden" / "town.mcap"
@@ -155,16 +155,17 @@ class Replay:
     def _call(self, request: replay_pb2.ReplayControl) -> replay_pb2.ReplayState:
         with channel(self.grpc) as opened:
             try:
-                return replay_pb2_grpc.ReplayServiceStub(opened).Control(request, timeout=PATIENCE_S)
+                state: replay_pb2.ReplayState = Stub(opened, "ReplayService").Control(request, timeout=PATIENCE_S)
             except grpc.RpcError as error:
                 raise refused(self.grpc, error) from None
+        return state
 
     def _control(self, **change: Any) -> ReplayState:
         state = self._call(replay_pb2.ReplayControl(**change))
         phase = replay_pb2.ReplayPhase.Name(state.phase).removeprefix("REPLAY_PHASE_").lower()
-        seconds = [(ns - state.begin_ns) * 1e-9 for ns in (state.position_ns, state.end_ns)]
+        position_s, end_s = ((ns - state.begin_ns) * 1e-9 for ns in (state.position_ns, state.end_ns))
         maps = dict(zip(state.vehicles, state.maps))
-        return ReplayState(phase, *seconds, state.rate, state.lockstep, state.awaited, maps)
+        return ReplayState(phase, position_s, end_s, state.rate, state.lockstep, state.awaited, maps)
 
     def close(self) -> None:
         """Stops the server as a crash would: without a word to its readers."""

@@ -8,7 +8,7 @@ import grpc
 import pytest
 
 import clearway
-from clearway.v1 import map_pb2, service_pb2, service_pb2_grpc
+from clearway.v1 import map_pb2, service_pb2
 
 
 def update(sequence):
@@ -16,7 +16,7 @@ def update(sequence):
     return service_pb2.MapUpdate(map=map_pb2.Map(header=header).SerializeToString())
 
 
-class Server(service_pb2_grpc.MapServiceServicer):
+class Server:
     """Tells a state, sends one map and ends; refuses the third stream."""
 
     def __init__(self):
@@ -41,7 +41,9 @@ def test_a_stream_waits_for_its_server_and_is_opened_again_until_it_is_refused(c
             pass
         assert address in maps.reasons[0]
         server = grpc.server(futures.ThreadPoolExecutor(2))
-        service_pb2_grpc.add_MapServiceServicer_to_server(Server(), server)
+        received, sent = service_pb2.WatchRequest.FromString, service_pb2.MapUpdate.SerializeToString
+        methods = {"Watch": grpc.stream_stream_rpc_method_handler(Server().Watch, received, sent)}
+        server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("clearway.v1.MapService", methods)])
         server.add_insecure_port(address)
         server.start()
         first, second = next(maps), next(maps)

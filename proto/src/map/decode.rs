@@ -9,7 +9,7 @@ use prost::Message;
 use crate::channel::by_class;
 use crate::channel::cells::Cells;
 use crate::channel::codec::{check_count, decode_on};
-use crate::limits::Limits;
+use crate::limits::{Limits, WIRE_VERSION};
 use crate::map::base::{Shift, base_of};
 use crate::map::error::MapError;
 use crate::map::grid::Grid;
@@ -73,6 +73,9 @@ pub fn decode_map_on(bytes: Bytes, base: Option<&Map>, limits: &Limits) -> Resul
 fn check_header(header: Option<v1::Header>) -> Result<v1::Header, MapError> {
     let wrong = |what: String| MapError::Header { what };
     let header = header.ok_or_else(|| wrong("absent; every map has one".into()))?;
+    if header.wire_version > WIRE_VERSION {
+        return Err(MapError::Version { version: header.wire_version, known: WIRE_VERSION });
+    }
     if header.capture_start_ns > header.capture_end_ns {
         return Err(wrong(format!(
             "capture starts at {} ns; that is after its end at {} ns",

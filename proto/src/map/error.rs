@@ -34,6 +34,14 @@ pub enum MapError {
         /// What is wrong, the value and what is needed.
         what: String,
     },
+    /// The map has a later major version of the wire.
+    #[error("wire of version {version}; this reader knows versions up to {known}")]
+    Version {
+        /// `Header.wire_version`.
+        version: u32,
+        /// [`crate::limits::WIRE_VERSION`].
+        known: u32,
+    },
     /// Two layers, or two channels of a layer, have one name.
     #[error("{what} {name:?} occurs twice; names are unique")]
     Twice {
@@ -157,6 +165,7 @@ impl MapError {
             Self::TooManyParts { .. } => "too_many_parts",
             Self::Protobuf(_) => "protobuf",
             Self::Header { .. } => "header",
+            Self::Version { .. } => "version",
             Self::Twice { .. } => "twice",
             Self::Geometry { .. } => "geometry",
             Self::TooManyCells { .. } => "too_many_cells",

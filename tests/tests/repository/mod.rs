@@ -2,9 +2,11 @@
 
 mod kit;
 mod modules;
+mod packages;
 mod ratchet;
 mod readme;
 mod tidy;
+mod wire;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -40,7 +42,9 @@ fn folders() -> Vec<PathBuf> {
 fn files(folder: &Path, endings: &[&str]) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for path in entries(folder) {
-        if path.is_dir() {
+        if path.is_dir() && path.is_symlink() {
+            // The folder that it names is listed where it lies.
+        } else if path.is_dir() {
             found.extend(files(&path, endings));
         } else if path.extension().and_then(|ending| ending.to_str()).is_some_and(|ending| endings.contains(&ending)) {
             found.push(path);

@@ -71,6 +71,7 @@ inline void read_header(Bytes message, Header& header) {
             }
             case 9: header.speed_mps = fields.f64(); break;
             case 14: header.epoch = fields.u32(); break;
+            case 16: header.wire_version = fields.u32(); break;
             default: break;
         }
     }
@@ -184,6 +185,10 @@ inline RawLayer read_layer(Bytes message) {
 }
 
 inline void check_header(const Header& header) {
+    if (header.wire_version > WIRE_VERSION) {
+        throw Error("version", "wire of version " + std::to_string(header.wire_version) +
+                                   "; this reader knows versions up to " + std::to_string(WIRE_VERSION));
+    }
     if (header.capture_start_ns > header.capture_end_ns) {
         throw Error("header", "capture starts at " + std::to_string(header.capture_start_ns) +
                                   " ns; that is after its end at " + std::to_string(header.capture_end_ns) + " ns");

@@ -99,7 +99,7 @@ struct Header {
     // Pose of the ego frame in the world frame at `capture_end_ns`, if one is known.
     std::optional<Pose> map_from_ego;
     std::optional<double> speed_mps;
-    std::uint32_t epoch = 0;
+    std::uint32_t epoch = 0, wire_version = 0;
 };
 
 // Reading of this machine's clocks. The wall clock counts ns since the Unix epoch and can be set; the steady clock

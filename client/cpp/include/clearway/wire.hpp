@@ -35,6 +35,8 @@ inline constexpr std::size_t MAP_PARTS_MAX = 1u << 16;
 inline constexpr unsigned NUMBER_BITS_MAX = 32;
 inline constexpr std::int64_t SAFE_POINT_STEPS_MAX = 1 << 24;
 inline constexpr std::uint32_t RGB_MAX = 0x00ffffff;
+// Latest major version of the wire that is read; 0 and 1 are the first one.
+inline constexpr std::uint32_t WIRE_VERSION = 1;
 
 namespace wire {
 

@@ -203,7 +203,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         reference_sensor: (map.sensors.get(usize::from(map.reference_sensor)))
             .map_or(String::new(), |sensor| sensor.name.to_string()),
         epoch: map.epoch,
-        replay: None,
+        ..v1::Header::default()
     }
 }
 

@@ -142,7 +142,7 @@ const HEADER = {
   1: ["vehicle", string], 2: ["boot_id", fixed64], 3: ["sequence", uint64], 4: ["capture_start_ns", sfixed64],
   5: ["capture_end_ns", sfixed64], 6: ["completed_ns", sfixed64], 7: ["valid_until_ns", sfixed64],
   8: ["map_from_ego", message(POSE)], 9: ["speed_mps", optional(double)], 10: ["sensors", repeated(message(SENSOR))],
-  11: ["compensation", string],
+  11: ["compensation", string], 16: ["wire_version", uint32],
 };
 const RADIAL = {
   1: ["row_radius_m", repeated(float)], 2: ["columns", uint32], 3: ["centre_x_m", float], 4: ["centre_y_m", float],

@@ -13,6 +13,9 @@ export const MAP_PARTS_MAX = 1 << 16;
 // Largest coordinate of a safe point in steps, and its largest radius in centimetres.
 export const SAFE_POINT_STEPS_MAX = 1 << 24;
 
+// Latest major version of the wire that is read; 0 and 1 are the first one.
+export const WIRE_VERSION = 1;
+
 // The error for a message that is refused. `reason` is the name that the golden vectors give the fault.
 export class DecodeError extends Error {
   name = "DecodeError";

@@ -5,7 +5,7 @@ import { baseByClass, decodeChannel } from "./codec.js";
 import { baseCells, baseLayer } from "./delta.js";
 import { gridOf } from "./grid.js";
 import { isWithoutLegend, readLegend } from "./legend.js";
-import { DecodeError, MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX } from "./limits.js";
+import { DecodeError, MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX, WIRE_VERSION } from "./limits.js";
 import { countParts, readLayer, readLayerName, readMap, readMapUpdate } from "./protobuf.js";
 import { readSafePoints } from "./safe_points.js";
 
@@ -35,6 +35,9 @@ export class LiveMap {
     }
     const { header, layers } = readMap(bytes);
     if (!header) throw new DecodeError("header", "the map has none");
+    if (header.wire_version > WIRE_VERSION) {
+      throw new DecodeError("version", `${header.wire_version}; versions up to ${WIRE_VERSION} are known`);
+    }
     this.header = header;
     for (const layer of layers) {
       const name = readLayerName(layer);

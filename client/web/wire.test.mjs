@@ -1,4 +1,4 @@
-// Tests of the decoder against the golden vectors of proto/golden. Run: cd server/web && node --test
+// Tests of the decoder against the golden vectors of proto/golden. Run: cd client/web && node --test
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -27,7 +27,7 @@ test("raw cells of every type decode to themselves", () => {
   assert.deepEqual(decoded(U16, [1, 2], 1), [513]);
 });
 
-const golden = (file) => JSON.parse(readFileSync(new URL(`../../../proto/golden/${file}`, import.meta.url)));
+const golden = (file) => JSON.parse(readFileSync(new URL(`../../proto/golden/${file}`, import.meta.url)));
 const bytesOf = (hex) => Uint8Array.from(hex.match(/../g) ?? [], (byte) => parseInt(byte, 16));
 
 test("the golden channels decode to their cells", () => {
@@ -39,7 +39,7 @@ test("the golden channels decode to their cells", () => {
   }
 });
 
-const goldenMap = (name) => new Uint8Array(readFileSync(new URL(`../../../proto/golden/${name}.bin`, import.meta.url)));
+const goldenMap = (name) => new Uint8Array(readFileSync(new URL(`../../proto/golden/${name}.bin`, import.meta.url)));
 
 // Every layer of a map with the cells of every channel.
 function decodeMap(bytes, base = null) {
@@ -58,6 +58,7 @@ test("the limits are those of the golden file", () => {
   assert.equal(limits.MAP_CELLS_MAX, map_cells_max);
   assert.equal(limits.MAP_BYTES_MAX, map_bytes_max);
   assert.equal(limits.MAP_PARTS_MAX, map_parts_max);
+  assert.equal(limits.WIRE_VERSION, others.wire_version);
   assert.equal(limits.SAFE_POINT_STEPS_MAX, others.safe_point_steps_max);
 });
 
