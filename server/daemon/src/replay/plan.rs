@@ -154,10 +154,6 @@ fn check(options: &ReplayOptions, mcap: Option<&Path>, journal: bool) -> Result<
         let reason = "the files name no vehicle; the option needs --config FILE or a recording of clearway";
         return unused(format!("--vehicle {name}"), reason.into());
     }
-    if let Some(set) = options.set.first().filter(|_| options.config.is_none() && !journal) {
-        let reason = "the files have no configuration; the option needs --config FILE or a recording of clearway";
-        return unused(format!("--set {set}"), reason.into());
-    }
     let Some(record) = &options.record else { return Ok(()) };
     if let Some(from) = options.from_s {
         let reason = "a recording begins with the first event; --to may end it earlier";
@@ -367,10 +363,11 @@ fn configured(options: &ReplayOptions, recorded: Option<&Path>) -> Result<KnownV
             return Ok(known(config, tables, Some(recording.header().boot_id), true));
         }
     }
-    Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
+    let config = overridden(Config::of_one_vehicle("car", "top"), options, &options.files[0])?;
+    Ok(known(config, vec![vec![None]], None, false))
 }
 
-/// A recorded configuration with the overrides of the options.
+/// A configuration with the overrides of the options.
 fn overridden(config: Config, options: &ReplayOptions, recording: &Path) -> Result<Config, ReplayError> {
     match &options.set[..] {
         [] => Ok(config),

@@ -19,6 +19,15 @@ const TOLERANCES: [[f32; 3]; 6] = [
     [0.17, 0.20, 0.0],
     [0.14, 0.16, 0.0],
 ];
+/// Greatest depth of the plane of most returns under the wheels, at the ego origin, metres, up to which no plane at the
+/// level of the wheels is sought. Ours: the noise of a mount.
+const DEPTH_M_MAX: f32 = 0.08;
+/// Tolerances of a plane at the level of the wheels, and its greatest distance to that level at the ego origin, metres.
+/// Ours: a road on a low dam is narrow, and most returns beside it lie on the fields, which are another plane.
+const LEVEL_TOLERANCES: [[f32; 3]; 3] = [[0.15, 0.15, 0.01], [0.14, 0.16, 0.0], [0.14, 0.16, 0.0]];
+const LEVEL_M_MAX: f32 = 0.15;
+/// Least number of cells that define a plane at the level of the wheels. Ours: three rings of a VLP-16 on a road of 6 m.
+const LEVEL_CELLS_MIN: usize = 80;
 /// Least number of cells that define the plane. Ours: one ring of a VLP-16 fills as many; the returns of sensors in the
 /// bumper, which see objects and no ground so near, fill a hundred.
 const CELLS_MIN: usize = 180;
@@ -44,17 +53,33 @@ impl NearPlane {
         a * x + b * y + c
     }
 
-    /// Fits the plane; the plane z = 0 if too few returns lie near one. `near` is a buffer.
+    /// Fits the plane; the plane z = 0 if too few returns lie near one. `near` is a buffer. Where the vehicle would stand
+    /// high over the plane of most returns, it stands on narrower ground, if there is such ground at its wheels.
     pub fn fit(cells: &PolarCells, near: &mut Vec<(usize, usize)>) -> Self {
-        let directions = column_directions();
         let rows = (0..ROWS).take_while(|row| row_start_m(*row) < RANGE_M_MAX).count();
         near.clear();
         let all = (0..rows).flat_map(|row| (0..COLUMNS).map(move |column| (row, column)));
         near.extend(all.filter(|(row, column)| cells.is_seen(row * COLUMNS + column)));
+        let of_most = Self::fit_from_level(cells, near, &TOLERANCES, CELLS_MIN);
+        if of_most.is_some_and(|plane| plane.abc[2] >= -DEPTH_M_MAX) {
+            return of_most.unwrap_or_default();
+        }
+        let at_wheels = Self::fit_from_level(cells, near, &LEVEL_TOLERANCES, LEVEL_CELLS_MIN);
+        at_wheels.filter(|plane| plane.abc[2].abs() <= LEVEL_M_MAX).or(of_most).unwrap_or_default()
+    }
+
+    /// Fits a plane to the returns near the level of the wheels, then near the plane of the round before.
+    fn fit_from_level(
+        cells: &PolarCells,
+        near: &[(usize, usize)],
+        tolerances: &[[f32; 3]],
+        cells_min: usize,
+    ) -> Option<Self> {
+        let directions = column_directions();
         let mut plane = Self::default();
-        for [above, below, a_metre] in TOLERANCES {
+        for [above, below, a_metre] in tolerances {
             let mut sums = Sums::default();
-            for &(row, column) in near.iter() {
+            for &(row, column) in near {
                 let [cos, sin] = directions[column];
                 let found = cells.lowest(row * COLUMNS + column).find_map(|point| {
                     let (x, y) = (point.range_m * cos, point.range_m * sin);
@@ -66,12 +91,13 @@ impl NearPlane {
                     sums.add(point, column * 12 / COLUMNS);
                 }
             }
-            match sums.solve() {
-                Some(abc @ [a, b, _]) if a * a + b * b <= SLOPE_MAX * SLOPE_MAX => plane = Self { abc, is_seen: true },
-                _ => return Self::default(),
+            let abc @ [a, b, _] = sums.solve(cells_min)?;
+            if a * a + b * b > SLOPE_MAX * SLOPE_MAX {
+                return None;
             }
+            plane = Self { abc, is_seen: true };
         }
-        plane
+        Some(plane)
     }
 }
 
@@ -93,9 +119,9 @@ impl Sums {
         self.of.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
     }
 
-    /// The plane of least squares; `None` if the returns do not define one.
-    fn solve(&self) -> Option<[f32; 3]> {
-        if self.cells < CELLS_MIN || self.directions.count_ones() < DIRECTIONS_MIN {
+    /// The plane of least squares; `None` if the returns do not define one, or are fewer cells than these.
+    fn solve(&self, cells_min: usize) -> Option<[f32; 3]> {
+        if self.cells < cells_min || self.directions.count_ones() < DIRECTIONS_MIN {
             return None;
         }
         let n = self.cells as f64;

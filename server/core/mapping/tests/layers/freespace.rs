@@ -39,6 +39,11 @@ fn is_free(layer: &Layer, cell: usize) -> bool {
     layer.legend[usize::from(classes(layer)[cell])].meaning == Meaning::Free
 }
 
+/// A cell that is not at the border of the grid, and the eight around it.
+fn around(cell: usize) -> [usize; 9] {
+    [-513, -512, -511, -1, 0, 1, 511, 512, 513].map(|by| cell.wrapping_add_signed(by))
+}
+
 /// The cells of a class whose centres are in a rectangle of the ego frame.
 fn count(layer: &Layer, class: FreespaceClass, x_m: [f32; 2], y_m: [f32; 2]) -> usize {
     let is_inside = |cell: &usize| {
@@ -121,7 +126,6 @@ fn gaps_between_posts_are_occupied_and_ground_far_from_free_cells_is_wide() {
     let post = |x: f32, y: f32| (8.0..8.25).contains(&x.abs().max(y.abs())) && (x + y).rem_euclid(0.75) < 0.25;
     let layer = freespace(&cast(Model::Hdl64eS2, |x, y, z| z <= if post(x, y) { 1.5 } else { 0.0 }));
     let class = |cell: usize| classes(&layer)[cell];
-    let around = |cell: usize| [-513, -512, -511, -1, 0, 1, 511, 512, 513].map(|by| cell.wrapping_add_signed(by));
     let heights = values(&layer, "height");
     let (mut ground, mut filled) = (0, 0);
     for cell in (0..512 * 512).filter(|cell| (1..511).contains(&(cell % 512)) && (1..511).contains(&(cell / 512))) {
@@ -172,6 +176,22 @@ fn a_trench_nearer_than_the_first_ring_is_a_drop_up_to_the_vehicle() {
         let (x_m, y_m) = ([from_m + 0.1, from_m + 1.9], [-2.5, 2.5]);
         assert_eq!(count(&layer, FreespaceClass::Free, x_m, y_m), 0, "{from_m}");
         assert!(count(&layer, FreespaceClass::Drop, x_m, y_m) >= 60, "{from_m}");
+    }
+}
+
+#[test]
+fn on_a_dam_the_road_is_free_and_its_edges_are_closed() {
+    for (model, depth_m) in [(Model::Hdl64eS2, 0.4), (Model::Hdl64eS2, 0.8), (Model::Hdl32e, 0.6), (Model::Vlp16, 0.6)]
+    {
+        let dam = |_: f32, y: f32, z: f32| z <= if y.abs() < 3.0 { 0.0 } else { -depth_m };
+        let layer = freespace(&cast(model, dam));
+        let road = count(&layer, FreespaceClass::Free, [-10.0, 10.0], [-2.5, 2.5]);
+        assert!(road > 1_000, "{model:?}, {depth_m} m: {road} of 1600 cells");
+        // The edge is closed on both sides, as far as the road before it is seen.
+        for (x_m, side) in (-30..30).flat_map(|at| [1.0, -1.0].map(|side| (at as f32 * 0.25, side))) {
+            let is_closed = |y: f32| !is_free(&layer, cell_at(&layer, x_m, side * y).expect("it is near"));
+            assert!((9..20).any(|at| is_closed(at as f32 * 0.25)), "{model:?}, {depth_m} m: {x_m} {side}");
+        }
     }
 }
 
