@@ -26,7 +26,8 @@ const DEPTH_M_MAX: f32 = 0.08;
 /// Ours: a road on a low dam is narrow, and most returns beside it lie on the fields, which are another plane.
 const LEVEL_TOLERANCES: [[f32; 3]; 3] = [[0.15, 0.15, 0.01], [0.14, 0.16, 0.0], [0.14, 0.16, 0.0]];
 const LEVEL_M_MAX: f32 = 0.15;
-/// Least number of cells that define a plane at the level of the wheels. Ours: three rings of a VLP-16 on a road of 6 m.
+/// Least number of cells that define a plane at the level of the wheels. Ours: three rings of a VLP-16 on a road of
+/// 6 m.
 const LEVEL_CELLS_MIN: usize = 80;
 /// Least number of cells that define the plane. Ours: one ring of a VLP-16 fills as many; the returns of sensors in the
 /// bumper, which see objects and no ground so near, fill a hundred.
@@ -53,8 +54,8 @@ impl NearPlane {
         a * x + b * y + c
     }
 
-    /// Fits the plane; the plane z = 0 if too few returns lie near one. `near` is a buffer. Where the vehicle would stand
-    /// high over the plane of most returns, it stands on narrower ground, if there is such ground at its wheels.
+    /// Fits the plane; the plane z = 0 if too few returns lie near one. `near` is a buffer. Where the vehicle would
+    /// stand high over the plane of most returns, it stands on narrower ground, if there is such ground at its wheels.
     pub fn fit(cells: &PolarCells, near: &mut Vec<(usize, usize)>) -> Self {
         let rows = (0..ROWS).take_while(|row| row_start_m(*row) < RANGE_M_MAX).count();
         near.clear();
