@@ -46,15 +46,34 @@ _log = logging.getLogger("clearway")
 def channel(address: str, tls: Tls | None = None) -> grpc.Channel:
     """A channel to `HOST:PORT`, also written `http://HOST:PORT`, with certificates `https://HOST:PORT`. The connection
     is made by the first call, which raises an error if no server answers or its certificate is rejected."""
-    target = address.removeprefix("http://" if tls is None else "https://").rstrip("/")
-    if "://" in target:
-        needed = "https:// needs tls" if target.startswith("https:") else "allowed: HOST:PORT, or zenoh:ENDPOINT"
-        raise ClearwayError("address", f"{address}: {needed}")
+    target = _target(address, "http://" if tls is None else "https://")
     if tls is None:
         return grpc.insecure_channel(target, options=_OPTIONS)
     pem = tls.read()
     credentials = grpc.ssl_channel_credentials(pem["ca"], pem.get("key"), pem.get("cert"))
     return grpc.secure_channel(target, credentials, options=_OPTIONS)
+
+
+def _target(address: str, scheme: str) -> str:
+    """Host and port of an address; the Rust client reads the same (`client/golden/addresses.json`)."""
+    target = address.removeprefix(scheme).rstrip("/")
+    host, has_port, port = target.rpartition(":")
+    if target.startswith("https://"):
+        wrong = "https needs certificates"
+    elif "://" in target:
+        wrong = f"another scheme than {scheme}"
+    elif "/" in target:
+        wrong = "a path, or an endpoint of zenoh"
+    elif not has_port:
+        wrong = "no port"
+    elif not host:
+        wrong = "no host"
+    elif not (port.isascii() and port.isdecimal() and int(port) < 65536):
+        wrong = "the port is no number up to 65535"
+    else:
+        return target
+    allowed = "HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051, https://HOST:PORT with certificates"
+    raise ClearwayError("address", f"server address {address!r}: {wrong}; {allowed}, or zenoh:ENDPOINT")
 
 
 def refused(address: str, error: grpc.RpcError) -> ClearwayError:

@@ -1,14 +1,30 @@
 """A stream over gRPC that is to reconnect, against a server in this process that ends each stream after a map."""
 
+import json
 import logging
 import socket
 from concurrent import futures
+from pathlib import Path
 
 import grpc
 import pytest
 
 import clearway
+from clearway.over_grpc import _target
 from clearway.v1 import map_pb2, service_pb2
+
+ADDRESSES = json.loads((Path(__file__).resolve().parents[2] / "golden" / "addresses.json").read_text())
+
+
+@pytest.mark.parametrize("case", ADDRESSES, ids=lambda case: case["address"])
+def test_every_client_accepts_and_refuses_the_same_addresses(case):
+    scheme = "https://" if case["certificates"] else "http://"
+    if case["refused"] is None:
+        assert "/" not in _target(case["address"], scheme)
+    else:
+        with pytest.raises(clearway.ClearwayError, match=case["refused"]) as error:
+            _target(case["address"], scheme)
+        assert error.value.reason == "address"
 
 
 def update(sequence):

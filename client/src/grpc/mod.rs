@@ -4,6 +4,7 @@
 //! connection with a small window and acknowledges every map, so a stalled reader delays no other reader and receives
 //! no old maps. A server that knows which other server serves a vehicle leads the client there.
 
+mod address;
 mod follow;
 mod refusal;
 
@@ -26,6 +27,7 @@ use crate::ingest::{Ingester, ReportReceiver, SendObservation};
 use crate::stream::MapStream;
 use crate::view::MapView;
 
+use address::url;
 use follow::{Watch, follow};
 use refusal::{innermost, refused};
 
@@ -129,21 +131,7 @@ impl Client {
 
     async fn open(address: &str, tls: Option<&Tls>) -> Result<Self, ClientError> {
         let wrong = |reason: &str| ClientError::Address { address: address.into(), reason: reason.into() };
-        let scheme = if tls.is_some() { "https://" } else { "http://" };
-        let rest = address.strip_prefix(scheme).unwrap_or(address).trim_end_matches('/');
-        if rest.starts_with("https://") {
-            return Err(wrong("https needs certificates"));
-        }
-        if rest.contains("://") {
-            return Err(wrong(&format!("another scheme than {scheme}")));
-        }
-        match rest.rsplit_once(':') {
-            None => return Err(wrong("no port")),
-            Some(("", _)) => return Err(wrong("no host")),
-            Some((_, port)) if port.parse::<u16>().is_err() => return Err(wrong("the port is no number up to 65535")),
-            Some(_) => {}
-        }
-        let url = format!("{scheme}{}", with_zone_number(rest));
+        let url = url(address, tls.is_some())?;
         let mut endpoint = Endpoint::from_shared(url.clone()).map_err(|error| wrong(&innermost(&error)))?;
         if let Some(tls) = tls {
             endpoint = endpoint.tls_config(tls.to_tonic()).map_err(|error| wrong(&innermost(&error)))?;
@@ -312,16 +300,6 @@ impl Tls {
             config = config.domain_name(&self.server_name);
         }
         config
-    }
-}
-
-/// An address with the number of its IPv6 zone in place of the name, such as `[fe80::1%2]:50051`: URLs have no names.
-fn with_zone_number(address: &str) -> String {
-    let zone = address.split_once('%').and_then(|(_, rest)| Some(rest.split_once(']')?.0));
-    let number = |zone: &str| std::fs::read_to_string(format!("/sys/class/net/{zone}/ifindex")).ok();
-    match zone.and_then(|zone| Some((zone, number(zone)?))) {
-        Some((zone, number)) => address.replacen(&format!("%{zone}]"), &format!("%{}]", number.trim()), 1),
-        None => address.to_owned(),
     }
 }
 
