@@ -8,10 +8,13 @@
 #   clearway-VERSION-ARCHITECTURE-v3.tar.gz          on x86-64 the same for processors with AVX2; the same maps.
 #                                                    On others glibc says "CPU ISA level is lower than required"
 #   clearway_VERSION_ARCHITECTURE.deb                the Debian package of the first
+#   clearway-VERSION.tar.gz, clearway-*.whl          the Python client, to be built and built
+#   clearway-map-VERSION.tgz                         the decoder for browsers and Node
 #   clearway.cdx.json                                what is in it (CycloneDX)
 #   SHA256SUMS                                       checksums of all these; sha256sum --check SHA256SUMS
 #
-# With BINARY nothing is built: that binary is packed. Needs cargo, dpkg-deb, ld, objdump, readelf and strip (binutils).
+# With BINARY no binary is built: that one is packed. Needs cargo, dpkg-deb, ld, objdump, readelf and strip (binutils),
+# python3 with venv, npm.
 set -eu
 
 mkdir -p "${1:?usage: release.sh FOLDER [BINARY]}"
@@ -68,6 +71,15 @@ if [ "$architecture" = x86_64 ] && [ -z "$given" ]; then
 fi
 deploy/debian/make-deb.sh "$binary" "$folder"
 deploy/make-sbom.sh "$folder"
+
+# The packages of the clients, from a copy: a build leaves its traces.
+mkdir "$root/source"
+git archive HEAD LICENSE client proto | tar -x -C "$root/source"
+python3 -m venv "$root/venv"
+"$root/venv/bin/pip" install --quiet build
+"$root/venv/bin/python" -m build --outdir "$folder" "$root/source/client/python" >/dev/null
+npm pack --silent --pack-destination "$folder" "$root/source/client/web" >/dev/null
+
 cd "$folder"
-sha256sum -- *.tar.gz *.deb *.cdx.json >SHA256SUMS
+sha256sum -- *.tar.gz *.whl *.tgz *.deb *.cdx.json >SHA256SUMS
 cat SHA256SUMS
