@@ -29,6 +29,13 @@ use crate::status::{CONTENT_TYPE, prometheus, vehicle_json};
 #[folder = "../web/"]
 struct Assets;
 
+/// The decoder, which is a package of its own. `../web/wire` links to it, for the tests in Node; a link that leads
+/// out of a folder is not followed here.
+#[derive(RustEmbed)]
+#[folder = "../../client/web/"]
+#[prefix = "wire/"]
+struct Decoder;
+
 /// What is served: the vehicles, the counts of the listeners by name, and the replay if there is one.
 #[derive(Clone)]
 pub struct Shown {
@@ -66,7 +73,7 @@ async fn asset(uri: Uri) -> Response {
     let path = if path.is_empty() { "index.html" } else { path };
     // The page's tests lie beside its files and are not served.
     let is_asset = !path.ends_with(".mjs") && !path.ends_with(".json");
-    match Assets::get(path).filter(|_| is_asset) {
+    match Assets::get(path).or_else(|| Decoder::get(path)).filter(|_| is_asset) {
         Some(file) => {
             let kind = file.metadata.mimetype().to_owned();
             let headers = [(header::CONTENT_TYPE, kind), (header::CACHE_CONTROL, "no-cache".to_owned())];
