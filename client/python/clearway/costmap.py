@@ -21,7 +21,7 @@ from .v1 import map_pb2
 if TYPE_CHECKING:
     from .layer import Layer
 
-#: Edge of the cells to which radial layers are resampled, in metres: that of the other layers. Most such cells from
+#: Edge of the cells to which radial layers are resampled, in metres: as other layers have them. Most such cells from
 #: the vehicle to the edge; larger grids get larger cells.
 _CELL_M, _CELLS_MAX = 0.25, 1000
 #: From the best to the worst: free cells have the occupancies 0 to 50, and then:

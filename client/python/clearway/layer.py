@@ -33,14 +33,14 @@ class Channel:
     unit: str
     #: Factor from `raw` to `values`.
     scale: float
-    #: Raw value of a cell of which nothing is known.
+    #: Raw value of an unknown cell.
     unknown: int
     #: Raw values, in the shape of the grid; read-only.
     raw: np.ndarray
 
     @property
     def values(self) -> np.ndarray:
-        """Values in `unit`; NaN for cells of which nothing is known."""
+        """Values in `unit`; NaN for unknown cells."""
         return np.where(self.raw == self.unknown, np.nan, self.raw * np.float64(self.scale))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -291,7 +291,7 @@ def _grid(message: map_pb2.Layer) -> Grid:
 
 
 def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
-    """(rows, columns) from the cells of a grid to those of its base layer at the same places."""
+    """(rows, columns) from the cells of a grid to the cells of its base layer at the same places."""
     if isinstance(before, CartesianGrid) and isinstance(now, CartesianGrid) and before.cell_m == now.cell_m:
         return now.first_iy - before.first_iy, now.first_ix - before.first_ix
     if isinstance(before, RadialGrid) and isinstance(now, RadialGrid):
@@ -302,7 +302,7 @@ def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
 
 
 def _legend(message: map_pb2.Layer, base: Layer | None) -> tuple[LegendEntry, ...]:
-    """Reads the legend of a layer, or that of the base layer if a delta has none. A meaning that this version does not
+    """Reads the legend of a layer; a delta without one has the legend of its base layer. A meaning that this version does not
     know becomes `Meaning.UNKNOWN`, so that a planner does not enter cells of that class."""
     names, meanings, colours = len(message.legend), len(message.legend_meanings), len(message.legend_rgb)
     if base is not None and not names | meanings | colours:

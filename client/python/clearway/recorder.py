@@ -16,8 +16,8 @@ _TIMEOUT_S = 30.0
 
 class Recorder:
     """The recorder of the server at HOST:PORT. A call returns the messages of service.proto, in which each field is
-    described, or raises a `ClearwayError`. The state that `start`, `stop` and `split` return may be that of a moment
-    before: `status` shows when the recorder has done it."""
+    described, or raises a `ClearwayError`. The state that `start`, `stop` and `split` return may be a moment
+    old: `status` shows when the recorder has done it."""
 
     def __init__(self, address: str, tls: Tls | None = None) -> None:
         self._address, self._tls = address, tls

@@ -41,7 +41,7 @@ def test_the_recorder_is_stopped_and_started_and_lists_its_parts_to_an_operator_
     wait_for("recording")
     assert recorder.list()[0].bytes > 0
     assert recorder.save(5, "from-python")
-    # The recorder of the test bed writes one file, as that of a replay does.
+    # The recorder of the test bed writes one file, as a replay does.
     with pytest.raises(clearway.ClearwayError, match="recorded to one file"):
         recorder.split()
     with pytest.raises(clearway.ClearwayError, match="allowed roles"):

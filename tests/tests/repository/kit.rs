@@ -114,7 +114,7 @@ fn the_test_in_rust_is_the_one_of_the_readme() {
 #[test]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
 fn the_test_in_python_passes_with_the_client_of_its_source_distribution_and_older_versions_of_protobuf() {
-    // The newest one is that of the client's own tests.
+    // The client's own tests have the newest one.
     for (name, versions) in [
         ("python-protobuf-5", &["protobuf==5.26.0", "grpcio==1.67.1"][..]),
         ("python-protobuf-6", &["protobuf==6.33.6"][..]),

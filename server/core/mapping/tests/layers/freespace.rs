@@ -214,7 +214,7 @@ fn free_cells_of_a_log(model: Model, lies: impl Fn(f32) -> bool, drops: impl Fn(
         let is_in = |x: f32, y: f32| (at_m..at_m + 0.3).contains(&x) && y.abs() < 1.0;
         let sweep = cast(model, |x, y, z| z <= if lies(at_m) && is_in(x, y) { 0.2 } else { 0.0 });
         let shared = shared_with(&sweep, &ReachConfig::default());
-        // A heading at which the cells of the vehicle are not those of the world.
+        // A heading at which the cells of the vehicle and of the world differ.
         let heading = UnitQuaternion::from_euler_angles(0.0, 0.0, 0.6);
         let middle = heading * Vector3::new(20.0 - f64::from(at_m), 0.0, 0.0);
         let context = Context {

@@ -36,7 +36,7 @@ const FIRST_DEPTH_M_MIN: f32 = 0.3;
 const FIRST_SHARE_MIN: f32 = 0.06;
 const FIRST_M_MAX: f32 = 10.0;
 /// Least depth of the first return under the level of the wheels, metres, and what is added as a share of its range.
-/// Ours: where a trench fills the view, the plane is that of its floor; and 10 % down is a slope.
+/// Ours: where a trench fills the view, the plane lies on its floor; and 10 % down is a slope.
 const WHEELS_M_MIN: f32 = 0.25;
 const WHEELS_SHARE: f32 = 0.1;
 /// How far a drop reaches beyond its two returns, metres. Ours: half a cell, and a cell.

@@ -7,8 +7,8 @@
 //! ground, such as grass, scores everywhere; a cell must score more there. A cell that scores little more than it must
 //! needs a neighbour.
 //!
-//! A step of the ground that is higher than the clearance is low too: its higher side. So is the cell right behind a
-//! low one that no return fell into: the thing hides its own back.
+//! A step of the ground that is higher than the clearance is low too: its higher side. So is a cell without
+//! a return right behind a low one: the thing hides its own back.
 
 use crate::reach::Reach;
 use crate::reach::bits::Bits;
@@ -84,7 +84,7 @@ impl LowThings {
         }
     }
 
-    /// Finds the low cells of the newest map: those of things, and those of steps.
+    /// Finds the low cells of the newest map: things, then steps.
     pub fn find(&mut self, reach: &Reach) -> [&Bits; 2] {
         self.copy_heights(reach);
         self.score();

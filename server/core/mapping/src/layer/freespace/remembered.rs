@@ -6,7 +6,7 @@
 //! in no more of them shown to be even. Things at the foot of something taller are left to the map that shows them:
 //! they are the wheels and feet of what moves. So are steps, which every map shows at their place to a cell.
 //!
-//! Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
+//! Cells lie in the world frame. If a pose is missing or jumps, everything is forgotten.
 
 use std::collections::BTreeMap;
 
@@ -46,6 +46,7 @@ impl Sightings {
         Self { newest: slot, found: self.found.map(later), even: later(self.even) }
     }
 
+    /// True if no map of the last five seconds found the cell.
     fn is_forgotten(self) -> bool {
         self.found == [0; KINDS]
     }
@@ -65,8 +66,8 @@ impl Sightings {
 pub struct Remembered {
     /// By cell of the world.
     cells: BTreeMap<[i32; 2], Sightings>,
-    /// How often the map's memory had forgotten everything.
-    drops: u64,
+    /// How often the memory of the ground had forgotten everything at the newest map.
+    forgotten: u64,
 }
 
 impl Remembered {
@@ -76,7 +77,7 @@ impl Remembered {
             self.cells.clear();
             return;
         };
-        if std::mem::replace(&mut self.drops, memory.drops) != memory.drops {
+        if std::mem::replace(&mut self.forgotten, memory.drops) != memory.drops {
             self.cells.clear();
         }
         let slot = context.stamp_ns.div_euclid(SLOT_NS);
