@@ -10,11 +10,13 @@
 //! | the plane of the ground near the vehicle | [`plane`] |
 //! | the ground grows outward from that plane, row by row | [`growth`] |
 //! | gaps are bridged, edges extrapolated, heights smoothed | [`surface`], `neighbourhood` |
+//! | returns under ground that other rays met before are mirror images | `mirrored` |
 //!
 //! The result does not depend on the order of the points: a cell keeps the lowest of whole numbers.
 
 pub mod config;
 pub mod growth;
+mod mirrored;
 mod neighbourhood;
 pub mod plane;
 pub mod polar;
@@ -86,9 +88,11 @@ impl Ground {
         self.surface.cover(&self.growth, &self.plane);
         self.write_nodes();
         self.measure_own_points(sweep);
+        self.leave_out_mirrored(sweep);
     }
 
-    /// Height of each point of the sweep over the ground, metres.
+    /// Height of each point of the sweep over the ground, metres; NaN where [`Self::height_over_m`] is, and for the
+    /// mirror images of things that stand on the ground.
     pub fn heights_m(&self) -> &[f32] {
         &self.heights_m
     }

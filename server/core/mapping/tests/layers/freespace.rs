@@ -180,6 +180,22 @@ fn a_trench_nearer_than_the_first_ring_is_a_drop_up_to_the_vehicle() {
 }
 
 #[test]
+fn mirror_images_under_the_feet_of_a_person_change_nothing() {
+    let person = |x: f32, y: f32, z: f32| z <= if libm::hypotf(x - 7.0, y - 1.0) < 0.3 { 1.7 } else { 0.0 };
+    let plain = cast(Model::Hdl64eS2, person);
+    let mut mirrored = plain.clone();
+    for step in 0..60 {
+        let turn = PI + (step as f32 - 30.0) / 40.0;
+        let depth_m = 0.35 + step as f32 / 100.0;
+        add(&mut mirrored, [7.0 + 0.3 * libm::cosf(turn), 1.0 + 0.3 * libm::sinf(turn), -depth_m]);
+    }
+    let [mirrored, plain] = [&mirrored, &plain].map(|sweep| freespace(sweep));
+    for cell in 0..classes(&plain).len() {
+        assert_eq!(class_name(&mirrored, cell), class_name(&plain, cell), "{:?}", centre(cell));
+    }
+}
+
+#[test]
 fn on_a_dam_the_road_is_free_and_its_edges_are_closed() {
     for (model, depth_m) in [(Model::Hdl64eS2, 0.4), (Model::Hdl64eS2, 0.8), (Model::Hdl32e, 0.6), (Model::Vlp16, 0.6)]
     {

@@ -28,7 +28,7 @@ const DEPTH_SHARE_MIN: f32 = 0.1;
 /// Distance over which the slope before the drop is measured, metres, and its greatest slope.
 const BACK_M: f32 = 2.5;
 const SLOPE_MAX: f32 = 0.2;
-/// Heights over the estimate of the ground of returns that may be ground, metres: lower ones are mirror images.
+/// Heights over the estimate of the ground of returns that may be ground, metres. Ours: lower ones are noise.
 const GROUND_M: std::ops::Range<f32> = -1.6..0.25;
 /// Least depth of the first return under the plane under the vehicle, metres, and as a share of its range; its greatest
 /// range, metres. Ours: a bend of 10 % that begins at the vehicle is no drop.
@@ -91,7 +91,10 @@ impl Drops {
         let rows = (0..ROWS).take_while(|row| row_start_m(*row) < RANGE_M_MAX + GAP_M.end);
         for cell in rows.map(|row| row * COLUMNS + column) {
             let height_m = ground.surface_m(cell);
-            let of_ground = |found: &Return| GROUND_M.contains(&(found.z_m - height_m));
+            let of_ground = |found: &Return| {
+                let over_m = found.z_m - height_m;
+                GROUND_M.contains(&over_m) && !ground.is_mirrored(column, found, over_m, sensor_m)
+            };
             self.returns.extend(ground.cells().lowest(cell).find(of_ground));
         }
         let fall = |found: &Return| (sensor_m - found.z_m) / found.range_m;
