@@ -18,7 +18,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     fs::write(out.join("recording.bin"), recorded.encode_to_vec())?;
     // Ordered maps: the same map must always give the same bytes.
     let messages = tonic_prost_build::configure().bytes(".clearway.v1").btree_map(".clearway.v1");
-    // Most updates have no state, which has a kilobyte.
-    messages.boxed(".clearway.v1.MapUpdate.vehicle").compile_fds(descriptors)?;
+    // Most updates have no state, which has a kilobyte, and no plan.
+    let messages = messages.boxed(".clearway.v1.MapUpdate.vehicle").boxed(".clearway.v1.MapUpdate.plan");
+    messages.boxed(".clearway.v1.Event.body.plan").compile_fds(descriptors)?;
     Ok(())
 }

@@ -1,6 +1,7 @@
 //! Why a call failed.
 
 use clearway_proto::map::MapError;
+use clearway_proto::plan::PlanError;
 
 use crate::footprint::shape::ShapeError;
 
@@ -73,6 +74,9 @@ pub enum ClientError {
     /// An area, a path or a point of a question cannot be judged.
     #[error(transparent)]
     Shape(#[from] ShapeError),
+    /// The plan of a planner cannot be drawn.
+    #[error("plan: {0}")]
+    Plan(#[from] PlanError),
     /// The question needs square cells.
     #[error("layer {layer:?} has a radial grid; the clearance is computed on square cells alone")]
     NoSquares {

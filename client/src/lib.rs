@@ -48,6 +48,7 @@ pub mod view;
 pub mod zenoh;
 
 pub use clearway_proto::map::{Channel, Layer, SafePoint};
+pub use clearway_proto::plan::PlanError;
 pub use clearway_proto::{codec, grid, v1};
 
 pub use error::ClientError;

@@ -126,6 +126,23 @@ impl MapView {
         })
     }
 
+    /// A plan that was made with this map: its path from point to point in the ego frame, in metres. Set what else is
+    /// known of it, such as `footprint_m`, `goal` and `text`, and send it ([`crate::Client::send_plan`]).
+    pub fn plan(&self, planner: &str, path: &[[f64; 2]]) -> v1::Plan {
+        let header = self.header();
+        v1::Plan {
+            vehicle: header.vehicle.clone(),
+            planner: planner.into(),
+            stamp_ns: header.capture_end_ns,
+            frame: v1::PlanFrame::Ego.into(),
+            map_sequence: Some(header.sequence),
+            map_from_ego: header.map_from_ego,
+            x: path.iter().map(|[x, _]| *x).collect(),
+            y: path.iter().map(|[_, y]| *y).collect(),
+            ..v1::Plan::default()
+        }
+    }
+
     /// Age of the map at `now_ns`, in ns, measured from the end of the capture. If the map came from a server, it is at
     /// least the age on arrival plus the time since, so that no step of the clock makes the map younger. Else it is
     /// negative if

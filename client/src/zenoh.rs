@@ -15,14 +15,14 @@ use std::time::{Duration, Instant};
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
-use clearway_proto::v1;
+use clearway_proto::{plan, v1};
 use prost::Message;
 use zenoh::qos::CongestionControl;
 use zenoh::sample::SourceInfo;
 use zenoh::{Config, Session};
 
 use crate::error::ClientError;
-use crate::freshness::Clock;
+use crate::freshness::{Clock, now_ns};
 use crate::grpc::Tls;
 use crate::ingest::{Ingester, ReportReceiver, SendObservation};
 use crate::signature::PublicKey;
@@ -214,6 +214,20 @@ impl ZenohClient {
 }
 
 impl ZenohClient {
+    /// Sends what a planner did with a map, as [`crate::Client::send_plan`]. The server counts a refusal in its status
+    /// and does not answer.
+    ///
+    /// # Errors
+    /// [`ClientError::Plan`] if the plan cannot be drawn, [`ClientError::Zenoh`] if zenoh fails.
+    pub async fn send_plan(&self, plan: &v1::Plan) -> Result<(), ClientError> {
+        plan::check(plan, now_ns())?;
+        let key = format!("clearway/{}/plan", plan.vehicle);
+        let put = self.session.put(&key, plan.encode_to_vec()).congestion_control(CongestionControl::Drop);
+        // With roles the server looks up the certificate of the session that this names.
+        let put = put.source_info(SourceInfo::new(self.session.id(), 0));
+        put.await.map_err(failed(format!("put {key}")))
+    }
+
     /// Opens a sender of a vehicle's observations. Each observation of a sensor must name the sensor.
     ///
     /// # Errors

@@ -13,6 +13,7 @@
 //! | [`grid`] | point in the ego frame <-> cell index |
 //! | [`legend`] | names, meanings and colours of a layer's classes |
 //! | [`safe_points`] | safe points <-> `SafePoints` |
+//! | [`plan`] | a planner's `Plan` -> whether it can be drawn; the plan in the ego frame of a map |
 //! | [`delta`] | two layers -> the changes between them |
 //! | [`region`] | layer and rectangle -> the part of the layer that contains the rectangle |
 
@@ -21,6 +22,7 @@ pub mod delta;
 pub mod limits;
 pub mod map;
 pub mod packed;
+pub mod plan;
 pub mod region;
 
 pub use channel::{by_class, cells, codec};

@@ -1,4 +1,4 @@
-//! Limits of the map format: one table for every decoder. `golden/limits.json` is written from it; the Python and
+//! Limits of plans, and of the map format: one table for every decoder. `golden/limits.json` is written from it; the Python and
 //! JavaScript decoders compare their limits with that file.
 
 /// Most cells of one channel: a square of 400 m with cells of 0.2 m. Ours; the default grids have at most 160,000.
@@ -20,7 +20,23 @@ pub const RGB_MAX: u32 = 0x00ff_ffff;
 /// Latest major version of the wire that is read; 0 and 1 are the first one.
 pub const WIRE_VERSION: u32 = 1;
 
-/// Name and value of each limit, as in `golden/limits.json`.
+/// Most points of a plan's path. Ours: 400 m in steps of 0.1 m.
+pub const PLAN_POINTS_MAX: usize = 4096;
+/// Most corners of a plan's footprint. Ours.
+pub const PLAN_CORNERS_MAX: usize = 64;
+/// Most bytes of the name of a planner. Ours: half a line on a picture.
+pub const PLANNER_BYTES_MAX: usize = 64;
+/// Most bytes of the text of a plan. Ours: some lines on a picture.
+pub const PLAN_TEXT_BYTES_MAX: usize = 256;
+/// Most bytes of an encoded plan: its points with headings, and ample for the rest.
+pub const PLAN_BYTES_MAX: usize = 128 << 10;
+/// Greatest time by which the stamp of a plan may be ahead of the server's clock, in ns: that of an observation.
+pub const PLAN_AHEAD_NS_MAX: i64 = 10_000_000_000;
+/// Greatest difference of the stamps of a plan and of a map over which it is drawn, in ns. Ours: two periods of a
+/// planner that plans once a second.
+pub const PLAN_DRAWN_NS_MAX: i64 = 2_000_000_000;
+
+/// Name and value of each limit of the map format, as in `golden/limits.json`.
 pub const TABLE: [(&str, u64); 8] = [
     ("channel_cells_max", CHANNEL_CELLS_MAX as u64),
     ("map_cells_max", MAP_CELLS_MAX),

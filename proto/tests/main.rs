@@ -5,3 +5,4 @@ mod codec;
 mod common;
 mod delta;
 mod golden;
+mod plan;

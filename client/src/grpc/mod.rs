@@ -12,9 +12,10 @@ use std::time::Duration;
 
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
+use clearway_proto::v1::plan_service_client::PlanServiceClient;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;
-use clearway_proto::{SERVED_AT, v1};
+use clearway_proto::{SERVED_AT, plan, v1};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt};
@@ -22,7 +23,7 @@ use tonic::Status;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 
 use crate::error::ClientError;
-use crate::freshness::Clock;
+use crate::freshness::{Clock, now_ns};
 use crate::ingest::{Ingester, ReportReceiver, SendObservation};
 use crate::stream::MapStream;
 use crate::view::MapView;
@@ -44,6 +45,7 @@ pub struct Client {
     address: String,
     endpoint: Endpoint,
     tls: Option<Tls>,
+    channel: Channel,
     service: MapServiceClient<Channel>,
 }
 
@@ -143,8 +145,9 @@ impl Client {
             .initial_connection_window_size(4 * WINDOW_BYTES)
             .http2_keep_alive_interval(KEEPALIVE)
             .keep_alive_timeout(KEEPALIVE);
-        let service = MapServiceClient::new(dial(&endpoint, &url).await?);
-        Ok(Self { address: url, endpoint, tls: tls.cloned(), service })
+        let channel = dial(&endpoint, &url).await?;
+        let service = MapServiceClient::new(channel.clone());
+        Ok(Self { address: url, endpoint, tls: tls.cloned(), channel, service })
     }
 
     /// State of every vehicle of the server.
@@ -212,7 +215,7 @@ impl Client {
         let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, .. } = subscription;
         let Subscription { replay_clock, reconnects, .. } = subscription;
         let max_in_flight = max_in_flight.max(1);
-        let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, states: true };
+        let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, states: true, plans: false };
         let (mut client, mut opened) = (self.clone(), self.watch(&selection).await?);
         if let Some(server) = self.led_by(opened.as_ref().err()).await? {
             opened = server.watch(&selection).await?;
@@ -245,6 +248,19 @@ impl Client {
             Some(address) => Self::open(address, self.tls.as_ref()).await.map(Some),
             None => Ok(None),
         }
+    }
+
+    /// Sends what a planner did with a map ([`MapView::plan`]), to be recorded and drawn over the maps. Needs the role of
+    /// an ingester, if clients have roles.
+    ///
+    /// # Errors
+    /// [`ClientError::Plan`] if the plan cannot be drawn, [`ClientError::Unreachable`] if the connection fails,
+    /// [`ClientError::Refused`] if the vehicle is unknown or there are too many plans.
+    pub async fn send_plan(&self, plan: &v1::Plan) -> Result<(), ClientError> {
+        plan::check(plan, now_ns())?;
+        let mut service = PlanServiceClient::new(self.channel.clone());
+        service.send(plan.clone()).await.map_err(|status| refused(&self.address, &status))?;
+        Ok(())
     }
 
     /// Opens a stream for a vehicle's observations, over a separate connection.

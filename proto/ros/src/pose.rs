@@ -1,5 +1,5 @@
 //! Poses: `nav_msgs/msg/Odometry`, `geometry_msgs/msg/PoseStamped`, `geometry_msgs/msg/PoseArray`,
-//! `tf2_msgs/msg/TFMessage`.
+//! `nav_msgs/msg/Path`, `tf2_msgs/msg/TFMessage`.
 //!
 //! In: the bytes of a message. Out: rigid transforms, each with the two frames it joins. As in tf2, a quaternion whose
 //! squared length is within 0.01 of 1 is normalised; any other is refused, such as the zeros of an unset message.
@@ -161,6 +161,14 @@ pub fn pose_array_to_cdr(header: &Header, poses: &[Isometry3<f64>]) -> Vec<u8> {
     let mut writer = Writer::default();
     writer.header(header).u32(length(poses.len()));
     poses.iter().fold(&mut writer, |writer, pose| write_pose(writer, pose));
+    writer.finish()
+}
+
+/// Encodes a `nav_msgs/msg/Path`, little-endian; each pose has the header of the path.
+pub fn path_to_cdr(header: &Header, poses: &[Isometry3<f64>]) -> Vec<u8> {
+    let mut writer = Writer::default();
+    writer.header(header).u32(length(poses.len()));
+    poses.iter().fold(&mut writer, |writer, pose| write_pose(writer.header(header), pose));
     writer.finish()
 }
 

@@ -2,7 +2,7 @@
 
 use clearway_ros::cdr::Header;
 use clearway_ros::pose::{
-    Odometry, StampedTransform, Twist, pose_array_to_cdr, pose_stamped, tf_message, tf_message_to_cdr,
+    Odometry, StampedTransform, Twist, path_to_cdr, pose_array_to_cdr, pose_stamped, tf_message, tf_message_to_cdr,
 };
 use clearway_ros::published::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
 use clearway_ros::published::markers::{Lines, marker_array_to_cdr};
@@ -96,6 +96,8 @@ fn poses_have_their_frames_and_speeds() {
 fn poses_and_lines_are_written_as_by_rosbags() {
     let header = Header { stamp_ns: STAMP_NS, frame_id: "car/base_link" };
     assert_eq!(pose_array_to_cdr(&header, &[golden_pose(), golden_pose()]), golden("pose_array"));
+    let path = Header { stamp_ns: STAMP_NS, frame_id: "map" };
+    assert_eq!(path_to_cdr(&path, &[golden_pose(), golden_pose()]), golden("path"));
     let points = vec![[1.0, 2.0, 0.0], [3.0, -4.0, 0.5]];
     let markers = [
         Lines { name: "links", width_m: 0.1, rgba: [1.0, 0.5, 0.25, 1.0], points },

@@ -2,6 +2,7 @@
 //! observation has a reason.
 
 mod many;
+mod plans;
 mod refused;
 mod ros;
 mod silent_peer;

@@ -80,6 +80,14 @@ pub const POSE_ARRAY: Published = Published::new(
     include_str!("definitions/PoseArray.msg"),
 );
 
+/// `nav_msgs/msg/Path`.
+pub const PATH: Published = Published::new(
+    "nav_msgs",
+    "Path",
+    "RIHS01_1957a5bb3cee5da65c4e52e52b65a93df227efce4c20f8458b36e73066ca334b",
+    include_str!("definitions/Path.msg"),
+);
+
 /// `visualization_msgs/msg/MarkerArray`.
 pub const MARKER_ARRAY: Published = Published::new(
     "visualization_msgs",

@@ -93,6 +93,9 @@ write("tf_message.cdr", T["tf2_msgs/msg/TFMessage"](transforms=[
     stamped(header=header("map"), child_frame_id="odom", transform=transform),
     stamped(header=header("odom", 0), child_frame_id="base_link", transform=transform)]))
 write("pose_array.cdr", T["geometry_msgs/msg/PoseArray"](header=header("car/base_link"), poses=[pose, pose]))
+stamped_pose = T["geometry_msgs/msg/PoseStamped"]
+write("path.cdr", T["nav_msgs/msg/Path"](
+    header=header("map"), poses=[stamped_pose(header=header("map"), pose=pose)] * 2))
 point, time = T["geometry_msgs/msg/Point"], T["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
 image = T["sensor_msgs/msg/CompressedImage"](
     header=T["std_msgs/msg/Header"](stamp=time, frame_id=""), format="", data=np.zeros(0, np.uint8))

@@ -49,6 +49,8 @@ pub enum Body {
     },
     /// The source has ended: its unfinished revolution becomes a partial one.
     End,
+    /// What a planner did with the maps, as bytes that the core does not read: no map depends on it.
+    Plan(Bytes),
 }
 
 impl Body {
@@ -61,7 +63,7 @@ impl Body {
             Self::Scan(_) => 2,
             Self::EgoPose(_) => 3,
             Self::Road(_) => 4,
-            Self::Sensor(_) | Self::Withdrawn | Self::Lost { .. } | Self::End => 5,
+            Self::Sensor(_) | Self::Withdrawn | Self::Lost { .. } | Self::End | Self::Plan(_) => 5,
         }
     }
 }

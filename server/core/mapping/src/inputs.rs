@@ -97,7 +97,7 @@ impl Inputs {
             Body::EgoPose(pose) => self.apply_ego_pose(pose, now).map(|()| InputOutcome::default())?,
             Body::Road(road) => self.apply_road(road, now).map(|()| InputOutcome::default())?,
             Body::Sensor(sensor) => self.declare_sensor(event.source, sensor).map(|()| InputOutcome::default())?,
-            Body::Lost { .. } => InputOutcome::default(),
+            Body::Lost { .. } | Body::Plan(_) => InputOutcome::default(),
         };
         if outcome.completed_scan.is_some() {
             self.motion.note_scan_end(self.scans[usize::from(event.source)].end_ns);

@@ -163,6 +163,7 @@ impl Ledgers {
                 self.each(event.source, |ledger| ledger.record_lost(*cause, *count));
             }
             (Body::Lost { cause, count }, _) => self.vehicle.record_lost(*cause, *count),
+            (Body::Plan(_), _) => {}
         }
     }
 

@@ -147,6 +147,9 @@ impl Pipeline {
 
     /// True if the event completed a map.
     fn apply(&mut self, event: &Event) -> Result<bool, EventError> {
+        if matches!(event.body, Body::Plan(_)) {
+            return Ok(false);
+        }
         let now = self.clock.advance(event.arrival_ns, (event.source, event.body.lane()));
         let outcome = self.inputs.apply(event, now);
         self.ledgers.record(event, &outcome);

@@ -6,6 +6,7 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`newest`] | contents of the latest-value slots between engine and readers |
+//! | [`plans`] | plans of planners -> the event queue; the newest plan |
 //! | [`subscriptions`] | readers -> layers to compute |
 //! | [`acknowledgements`] | readers that acknowledge -> the maps that they have finished with |
 //! | [`wires`] | the channels between the engine and its readers |
@@ -14,6 +15,7 @@
 pub mod acknowledgements;
 pub mod compute_permits;
 pub mod newest;
+pub mod plans;
 pub mod subscriptions;
 pub mod wires;
 
@@ -23,7 +25,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use clearway_mapping::error::EventError;
-use clearway_mapping::event::{EgoPose, Event};
+use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use nalgebra::Vector3;
@@ -169,6 +171,9 @@ impl Engine {
     fn step_event(&mut self, event: &Event) -> Result<(), EventError> {
         if let Some(recording) = &mut self.recording {
             recording.record_event(event);
+        }
+        if let Body::Plan(plan) = &event.body {
+            self.wires.plans.publish(plan, self.replayed.map_or(0, |replayed| replayed.shift_ns));
         }
         let (began, waited) = (Instant::now(), duration(now_ns().saturating_sub(event.arrival_ns)));
         self.update_layers();

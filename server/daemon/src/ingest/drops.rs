@@ -77,6 +77,11 @@ impl DropCounters {
         *locked(&self.refused_messages).entry("ros_part").or_default() += count;
     }
 
+    /// Counts a plan that was refused. No map depends on it, so the ledger and the journal do not have it.
+    pub(crate) fn record_refused_plan(&self) {
+        *locked(&self.refused_messages).entry("plan").or_default() += 1;
+    }
+
     /// Remembers the sender of a datagram that arrived at `newest_ns`.
     pub(super) fn record_unknown_sender(&self, address: SocketAddr, newest_ns: i64) {
         let mut senders = locked(&self.unknown_senders);

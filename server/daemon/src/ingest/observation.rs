@@ -205,7 +205,7 @@ pub fn check_stamps(bodies: Bodies, now_ns: i64, limits: &Limits) -> Result<Bodi
             Body::Scan(scan) => Some(scan.stamp_ns),
             Body::EgoPose(pose) => Some(pose.stamp_ns),
             Body::Road(road) => Some(road.stamp_ns),
-            Body::Datagram(_) | Body::Sensor(_) | Body::Withdrawn | Body::Lost { .. } | Body::End => None,
+            _ => None,
         };
         for stamp_ns in [*captured_ns, of_body].into_iter().flatten() {
             let ahead_ns = stamp_ns.saturating_sub(now_ns);

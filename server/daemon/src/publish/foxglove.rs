@@ -1,7 +1,7 @@
 //! Maps, points and poses for Foxglove, and for other clients of its WebSocket protocol (`foxglove.sdk.v1`).
 //!
 //! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`: lines and
-//! circles of the layer `safe_path`), `/<vehicle>/log` (`foxglove.Log`: the end of a replay), `/<vehicle>/points`
+//! circles of the layer `safe_path`), `/<vehicle>/plan` (the same: the newest plan), `/<vehicle>/log` (`foxglove.Log`: the end of a replay), `/<vehicle>/points`
 //! (`foxglove.PointCloud`: what the newest map was made from)
 //! and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels without a subscription are not
 //! made; a message is encoded once for all clients. A new subscription gets the newest map at once. A slow client skips
@@ -88,6 +88,7 @@ enum Kind {
     Points,
     Transforms,
     Log,
+    Plan,
 }
 
 /// A message of a channel, without the subscription that it is for.
@@ -112,14 +113,14 @@ impl Channel {
         match self.kind {
             Kind::Layer(name) => Some(name),
             Kind::SafePoints => Some(safe_paths::LAYER),
-            Kind::Points | Kind::Transforms | Kind::Log => None,
+            Kind::Points | Kind::Transforms | Kind::Log | Kind::Plan => None,
         }
     }
 
     fn schema(&self) -> Option<Schema> {
         match self.kind {
             Kind::Layer(_) => Grid::get_schema(),
-            Kind::SafePoints => SceneUpdate::get_schema(),
+            Kind::SafePoints | Kind::Plan => SceneUpdate::get_schema(),
             Kind::Points => PointCloud::get_schema(),
             Kind::Transforms => FrameTransforms::get_schema(),
             Kind::Log => Log::get_schema(),
@@ -179,6 +180,7 @@ impl VehicleChannels {
             kinds.push((format!("/{vehicle}/safe_points"), Kind::SafePoints));
         }
         kinds.push((format!("/{vehicle}/log"), Kind::Log));
+        kinds.push((format!("/{vehicle}/plan"), Kind::Plan));
         kinds.push((format!("/{vehicle}/points"), Kind::Points));
         kinds.push(("/tf".to_owned(), Kind::Transforms));
         let channel = |(topic, kind)| {
@@ -192,9 +194,13 @@ impl VehicleChannels {
     /// Publishes a line of the log, after all maps so far.
     fn log(&self, text: &str) {
         let now_ns = now_ns();
-        for channel in self.channels.iter().filter(|channel| channel.kind == Kind::Log) {
-            channel.put(0, u64::try_from(now_ns).unwrap_or(0), &messages::log(now_ns, &self.served.status.name, text));
-        }
+        self.put(Kind::Log, now_ns, &messages::log(now_ns, &self.served.status.name, text));
+    }
+
+    /// Publishes a message that belongs to no map.
+    fn put<T: Encode>(&self, kind: Kind, log_ns: i64, message: &T) {
+        let channels = self.channels.iter().filter(|channel| channel.kind == kind);
+        channels.for_each(|channel| channel.put(0, u64::try_from(log_ns).unwrap_or(0), message));
         self.published.send_modify(|count| *count += 1);
     }
 
@@ -204,6 +210,7 @@ impl VehicleChannels {
         let mut rasters = Rasters::default();
         let mut sweeps = None;
         newest.mark_changed();
+        let mut plans = self.served.wires.plans.subscribe();
         let mut replay_ended = self.served.wires.replay_ended.subscribe();
         // What is so from the beginning is no change.
         let mut reported = false;
@@ -221,6 +228,12 @@ impl VehicleChannels {
                 },
                 () = self.subscribed.notified() => {}
                 Ok(()) = replay_ended.changed() => continue,
+                Ok(()) = plans.changed() => {
+                    if let Some(plan) = plans.borrow_and_update().clone() {
+                        self.put(Kind::Plan, plan.stamp_ns, &messages::plan(&self.served.status.name, &plan));
+                    }
+                    continue;
+                }
             }
             let has_points = |channel: &Channel| channel.kind == Kind::Points && channel.newest.receiver_count() > 0;
             match self.channels.iter().any(has_points) {
@@ -257,8 +270,8 @@ fn publish(channel: &Channel, map: &EncodedMap, sweep: &NewestSweep, rasters: &m
                 channel.publish(map, &transforms);
             }
         }
-        // It has no map.
-        Kind::Log => {}
+        // They have no map.
+        Kind::Log | Kind::Plan => {}
         Kind::Points => {
             if let Some(sweep) = sweep.as_ref().filter(|sweep| sweep.0 == map.capture_end_ns) {
                 let sweep = &sweep.1;

@@ -385,14 +385,8 @@ impl Live {
         if self.watching.len() >= WATCHES_MAX && !self.watching.contains_key(&vehicle) {
             return Err(Status::resource_exhausted(format!("at most {WATCHES_MAX} vehicles are allowed at a time")));
         }
-        let selection = v1::Selection {
-            vehicle: vehicle.clone(),
-            layers,
-            max_in_flight,
-            max_rate_hz,
-            deltas,
-            ..Default::default()
-        };
+        let of = v1::Selection { vehicle: vehicle.clone(), layers, max_in_flight, max_rate_hz, ..Default::default() };
+        let selection = v1::Selection { deltas, plans: true, ..of };
         let (requests, receiver) = mpsc::channel(REQUESTS_MAX);
         let updates = watch_from_page(served, selection, receiver)?;
         self.updates.insert(vehicle.clone(), Box::pin(updates));

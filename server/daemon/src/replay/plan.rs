@@ -393,7 +393,7 @@ fn first_revolutions(
             },
             Body::Scan(scan) => revolutions.push(|| points_of_scan(scan)),
             Body::End => sensor.finish().is_none_or(|revolution| revolutions.push(|| points_of(revolution))),
-            Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::Withdrawn | Body::Lost { .. } => true,
+            _ => true,
         };
         if !needs_more {
             break;

@@ -11,12 +11,15 @@
 //! | `save_rules` | stale maps and lost sensors -> saves of the recording |
 //! | `uploads` | finished parts of the recording -> the store |
 //! | `over_zenoh` | everything that uses the zenoh session |
+//! | `plans_over_zenoh` | plans of planners -> the event queue of their vehicle |
 //! | `router` | a router that answers later than at the start -> the session; whether one is connected -> status, log |
 
 mod input;
 mod listeners;
 #[cfg(feature = "zenoh")]
 mod over_zenoh;
+#[cfg(feature = "zenoh")]
+mod plans_over_zenoh;
 #[cfg(feature = "zenoh")]
 mod router;
 mod running;

@@ -6,6 +6,7 @@ use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::pubsub::Subscriber;
 
+use super::plans_over_zenoh;
 use crate::config::{Config, ZenohMode};
 use crate::fleet::Fleet;
 use crate::ingest::gateway::Gateways;
@@ -71,6 +72,9 @@ impl OverZenoh {
         for gateway in gateways.all() {
             let subscribed = Ingest::subscribe(&session, gateway.clone(), senders(&session, config)).await?;
             ingest.spawn(subscribed.run());
+        }
+        for served in vehicles.0.iter() {
+            plans_over_zenoh::take(&session, served, senders(&session, config), &mut ingest).await?;
         }
         for (vehicle, queue) in config.vehicles.iter().zip(queues) {
             let operators = senders(&session, config);

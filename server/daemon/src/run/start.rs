@@ -82,7 +82,7 @@ impl Server {
             tables.resize(vehicle.sensors.len(), None);
             let core = (vehicle.core(), tables.clone());
             let pipeline = Pipeline::new(&core.0, core.1.clone())?;
-            prepared.push(running.prepare(vehicle, boot_id, pipeline, core, observer.take()));
+            prepared.push(running.prepare(vehicle, boot_id, pipeline, core, observer.take(), setup.is_stepped));
         }
         running.vehicles = Vehicles(prepared.iter().map(|prepared| prepared.served.clone()).collect());
         let header = || header(&config, &calibrations, boot_id, &setup.config_comments, setup.metadata);
@@ -125,20 +125,20 @@ impl Running {
         pipeline: Pipeline,
         core: (VehicleConfig, Vec<Option<Calibration>>),
         observer: Option<Observer>,
+        is_stepped: bool,
     ) -> Prepared {
         let name: Arc<str> = vehicle.name.as_str().into();
         let (queue, events) = event_queue(vehicle.queue);
         let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
         let layers = layer_names(&vehicle.maps);
-        let wires = Wires::new(&layers);
+        let wires = Wires::new(&layers).with_plans((!is_stepped).then(|| queue.clone()), queue.drops());
         let status = VehicleStatus::new(name.clone(), boot_id, layers, queue.drops());
         status.show_queue(queue.space());
         let status = Arc::new(status.with_outline(vehicle.body.as_ref()).with_traces(self.traces.clone()));
         let (newest, receiver) = watch::channel(None);
-        let valid_ms = vehicle.maps.valid_ms;
         let engine = Engine {
             pipeline,
-            valid_ms,
+            valid_ms: vehicle.maps.valid_ms,
             newest,
             wires: wires.clone(),
             recording: None,

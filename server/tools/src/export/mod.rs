@@ -12,9 +12,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
-use clearway_client::{Layer, MapView};
+use clearway_client::{Layer, MapView, v1};
 use clearway_daemon::base::files;
 use clearway_journal::mcap_reader::{McapReader, Message};
+use clearway_proto::plan;
+use prost::Message as _;
 
 use self::viewer_file::{Dialect, ViewerFile};
 use crate::picture::{self, PictureStyle};
@@ -144,7 +146,13 @@ impl ExportOptions {
     }
 
     /// The files of one layer of a map: the end of each file's name, and its bytes.
-    fn encode(&self, map: &MapView, layer: &Layer, style: &PictureStyle) -> Result<Vec<(String, Vec<u8>)>> {
+    fn encode(
+        &self,
+        map: &MapView,
+        layer: &Layer,
+        style: &PictureStyle,
+        plan: Option<&v1::Plan>,
+    ) -> Result<Vec<(String, Vec<u8>)>> {
         match self.format {
             ExportFormat::Json => Ok(vec![(".json".into(), serde_json::to_vec(&layer_json::layer(map, layer, true))?)]),
             ExportFormat::Npy => {
@@ -156,7 +164,9 @@ impl ExportOptions {
                 Ok(arrays.chain([(".json".into(), document)]).collect())
             }
             _ => {
-                let style = PictureStyle { caption: picture::caption(map.header(), &layer.name), ..style.clone() };
+                let header = map.header();
+                let plan = plan.and_then(|of| plan::over(of, header.capture_end_ns, header.map_from_ego.as_ref()));
+                let style = PictureStyle { caption: picture::caption(header, &layer.name), plan, ..style.clone() };
                 let ending = style.channel.as_ref().map_or(".png".into(), |channel| format!("_{channel}.png"));
                 Ok(vec![(ending, picture::png(layer, &style)?)])
             }
@@ -180,13 +190,15 @@ pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Re
         ExportFormat::Ros2 => Some(create(Dialect::Ros2)?),
         _ => None,
     };
-    let (mut exported, mut vehicles) = (Exported::default(), BTreeSet::new());
+    let (mut exported, mut vehicles, mut plans) = (Exported::default(), BTreeSet::new(), BTreeMap::new());
     while let Some(message) = recording.next() {
         let message = message?;
         progress(recording.bytes_read(), exported.maps.values().sum());
         let is_of_vehicle = options.vehicle.as_ref().is_none_or(|only| message.vehicle() == Some(only));
         if let Some(viewer) = viewer.as_mut().filter(|_| is_of_vehicle) {
             viewer.write_event(&message, recording.header())?;
+        } else if let Some(plan) = plan_of(&message) {
+            plans.insert(message.journal_of().map(str::to_owned), plan);
         }
         let Some((vehicle, name)) = options.map_of(&message) else { continue };
         let Some(style) = styles.as_ref().map_or(Some(&options.style), |styles| styles.get(name)) else { continue };
@@ -199,7 +211,7 @@ pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Re
                 let names: Vec<String> = vehicles.into_iter().collect();
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), names.join(" and "))
             }
-            None => write_files(&format!("{:06}_{name}", map.sequence()), options.encode(&map, layer, style)?, out)?,
+            None => write_files(&format!("{:06}_{name}", map.sequence()), options.encode(&map, layer, style, plans.get(&Some(vehicle.to_owned())))?, out)?,
         }
         *exported.maps.entry(name.to_owned()).or_default() += 1;
     }
@@ -210,6 +222,15 @@ pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Re
         bail!("{}", options.nothing(&recording, None));
     }
     Ok(Exported { incomplete: recording.incomplete(), ..exported })
+}
+
+/// The plan of an event of a journal that can be drawn.
+fn plan_of(message: &Message) -> Option<v1::Plan> {
+    message.journal_of()?;
+    match v1::Event::decode(message.data.clone()).ok()?.body? {
+        v1::event::Body::Plan(plan) if plan::check(&plan, plan.stamp_ns).is_ok() => Some(*plan),
+        _ => None,
+    }
 }
 
 /// Writes the files of one layer to the folder `out`; `stem` is the beginning of their names.

@@ -1,10 +1,10 @@
 //! A recording -> one MCAP file that viewers open without a plug-in.
 //!
 //! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`),
-//! `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf` (`foxglove.FrameTransforms`). ros2:
+//! `/<vehicle>/plan` (the same), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf` (`foxglove.FrameTransforms`). ros2:
 //! `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the layer's other topics ([`ros::topics_of`]),
 //! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
-//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording,
+//! (`nav_msgs/msg/Odometry`), `/clearway/<vehicle>/plan` (`nav_msgs/msg/Path`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording,
 //! and the stamp of the capture's or the scan's end. With points the poses of ros2 are the recorded ones with their own
 //! stamps, so that a replay of the file has the poses of the drive; without points they are the poses of the maps.
 
@@ -21,13 +21,14 @@ use clearway_daemon::encode::viewer::raster::Rasters;
 use clearway_daemon::encode::viewer::ros::ShownLayer;
 use clearway_daemon::encode::viewer::{FrameNames, base_frame, foxglove as messages, ros, safe_paths};
 use clearway_mapping::event::EgoPose;
-use clearway_ros::published::{ODOMETRY, POINT_CLOUD2, Published, TF_MESSAGE};
+use clearway_ros::published::{ODOMETRY, PATH, POINT_CLOUD2, Published, TF_MESSAGE};
 use foxglove::Encode;
 use foxglove::messages::FrameTransforms;
 use mcap::records::MessageHeader;
 use prost::Message as _;
 use serde::Deserialize;
 
+use super::plan_of;
 use super::scans::{DecodedScan, ScanDecoder, ScanPoints};
 use clearway_daemon::base::files;
 use clearway_journal::mcap_file::CHUNK_NS;
@@ -85,12 +86,18 @@ impl ViewerFile {
         })
     }
 
-    /// Writes the points of the scan that an event completes, or its pose; `header` is the recording's.
+    /// Writes the plan of an event; with points, the points of the scan that it completes, or its pose; `header` is the recording's.
     ///
     /// # Errors
     /// If the event or the header is wrong, or the file cannot be written.
     pub fn write_event(&mut self, message: &Message, header: &Header) -> Result<()> {
-        let Some(vehicle) = message.journal_of().filter(|_| self.with_points) else { return Ok(()) };
+        let Some(vehicle) = message.journal_of() else { return Ok(()) };
+        if let Some(plan) = plan_of(message) {
+            return self.write_plan(vehicle, &plan, message.log_ns);
+        }
+        if !self.with_points {
+            return Ok(());
+        }
         let mut decoder = match self.decoder.take() {
             Some(decoder) => decoder,
             None => ScanDecoder::new(header)?,
@@ -166,6 +173,18 @@ impl ViewerFile {
         let pose = EgoPose { stamp_ns: pose.stamp_ns, map_from_ego, speed_mps: pose.speed_mps };
         self.with_poses.insert(vehicle.to_owned());
         self.write_odometry(vehicle, &pose, message.log_ns)
+    }
+
+    fn write_plan(&mut self, vehicle: &str, plan: &v1::Plan, log_ns: u64) -> Result<()> {
+        match self.dialect {
+            Dialect::Foxglove => {
+                self.write_foxglove(&format!("/{vehicle}/plan"), &messages::plan(vehicle, plan), log_ns)
+            }
+            Dialect::Ros2 => {
+                let path = ros::path_of(&self.frames_of(vehicle), plan);
+                self.write_ros((&format!("/clearway/{vehicle}/plan"), false), &PATH, &path, log_ns)
+            }
+        }
     }
 
     fn write_odometry(&mut self, vehicle: &str, pose: &EgoPose, log_ns: u64) -> Result<()> {

@@ -2,7 +2,8 @@
 //!
 //! The picture rotates with the vehicle: up is ahead, not north. It shows the classes in the colours of the layer's
 //! legend, or one channel: ids in one colour each, other values from dark to light. Safe points of the layer are drawn
-//! as lines between linked points, and circles with their radii. Under the map stand the caption, what the colours mean
+//! as lines between linked points, and circles with their radii; over them the path of a plan, its footprint at the
+//! end, and its goal. Under the map stand the caption, what the colours mean
 //! and a scale bar; the PNG's text `Comment` has the channel, its least and greatest value and its unit. The picture of
 //! a stale map has a red frame and the word STALE.
 //!
@@ -21,7 +22,7 @@ use clearway_daemon::encode::colours::{Colours, UNKNOWN};
 use clearway_daemon::encode::palette::Rgb;
 use clearway_daemon::encode::viewer::safe_paths;
 use clearway_proto::map::{Layer, SafePoint};
-use clearway_proto::v1;
+use clearway_proto::{plan, v1};
 
 use image::{LETTER, Picture};
 use legend::Swatch;
@@ -33,6 +34,8 @@ const VEHICLE_HALF_M: (f64, f64) = (2.2, 0.9);
 /// Colours of the links of safe points, and of the circles with their radii.
 const LINK: Rgb = [255, 225, 77];
 const CIRCLE: Rgb = [200, 200, 210];
+/// Colour of a plan.
+const PLAN: Rgb = [255, 79, 216];
 /// Colour of the frame of a stale map and of the ground of its word.
 const STALE: Rgb = [200, 24, 24];
 /// Word on a stale map.
@@ -51,6 +54,8 @@ pub struct PictureStyle {
     pub values: Option<[f64; 2]>,
     /// Lines of text under the map, such as the stamp.
     pub caption: Vec<String>,
+    /// The plan that is drawn over the map, in the ego frame.
+    pub plan: Option<v1::Plan>,
     /// True if the map is stale.
     pub stale: bool,
 }
@@ -58,7 +63,7 @@ pub struct PictureStyle {
 impl Default for PictureStyle {
     /// 800 pixels, ours, because that fits a screen; the whole grid and the classes.
     fn default() -> Self {
-        Self { pixels: 800, range_m: None, channel: None, values: None, caption: Vec::new(), stale: false }
+        Self { pixels: 800, range_m: None, channel: None, values: None, caption: Vec::new(), plan: None, stale: false }
     }
 }
 
@@ -172,6 +177,9 @@ fn draw(
             draw_line(&mut map, pixel(ends[0][0], ends[0][1]), pixel(ends[1][0], ends[1][1]), colour, width);
         }
     }
+    for [from, to] in style.plan.iter().flat_map(plan::lines) {
+        draw_line(&mut map, pixel(from[0], from[1]), pixel(to[0], to[1]), PLAN, 3);
+    }
     let [left, top] = pixel(VEHICLE_HALF_M.0, VEHICLE_HALF_M.1).map(|pixel| pixel.max(0.0).round() as usize);
     let [width, height] = [VEHICLE_HALF_M.1, VEHICLE_HALF_M.0].map(|half| (2.0 * half / pixel_m).round() as usize);
     map.fill((left, top), (width, height), VEHICLE);
@@ -179,7 +187,8 @@ fn draw(
         mark_stale(&mut map);
     }
     let caption = style.caption.iter().map(|line| (Swatch::None, line.clone()));
-    legend::with_lines(&map, caption.chain(meanings).collect(), pixel_m)
+    let planned = style.plan.iter().map(|plan| (Swatch::Colour(PLAN), format!("plan {} {}", plan.planner, plan.text)));
+    legend::with_lines(&map, caption.chain(meanings).chain(planned).collect(), pixel_m)
 }
 
 /// Draws a straight line; what lies outside the map is left out.

@@ -175,6 +175,7 @@ pub fn event_to_proto(event: &Event) -> v1::Event {
         Body::Lost { count, .. } => v1::event::Body::Lost(*count),
         Body::End => v1::event::Body::End(v1::End {}),
         Body::Withdrawn => v1::event::Body::Withdrawn(v1::Withdrawn {}),
+        Body::Plan(plan) => v1::event::Body::Plan(Box::new(v1::Plan::decode(plan.clone()).unwrap_or_default())),
     };
     v1::Event {
         sequence: event.sequence,
@@ -259,6 +260,7 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventDecodeError> {
         }
         v1::event::Body::End(v1::End {}) => Body::End,
         v1::event::Body::Withdrawn(v1::Withdrawn {}) => Body::Withdrawn,
+        v1::event::Body::Plan(plan) => Body::Plan(plan.encode_to_vec().into()),
     };
     Ok(Event { sequence, arrival_ns: event.arrival_ns, source, body })
 }
@@ -308,6 +310,7 @@ mod tests {
             Body::Lost { cause: Cause::Kernel, count: 3 },
             Body::End,
             Body::Withdrawn,
+            Body::Plan(v1::Plan { x: vec![1.0], y: vec![f64::MIN], ..Default::default() }.encode_to_vec().into()),
         ];
         for (sequence, body) in (0..).zip(bodies) {
             let event = Event { sequence, arrival_ns: i64::MIN + 1, source: 3, body };

@@ -1,13 +1,15 @@
-//! A map -> Foxglove messages: `foxglove.Grid` for each layer, `foxglove.SceneUpdate` of safe points,
+//! A map -> Foxglove messages: `foxglove.Grid` for each layer, `foxglove.SceneUpdate` of safe points and of plans,
 //! `foxglove.FrameTransforms`, and `foxglove.PointCloud` of points.
 
+use clearway_proto::limits::PLAN_DRAWN_NS_MAX;
 use clearway_proto::map::Layer;
+use clearway_proto::{plan, v1};
 use foxglove::messages::line_primitive::Type;
 use foxglove::messages::log::Level;
 use foxglove::messages::packed_element_field::NumericType;
 use foxglove::messages::{
     Color, Duration, FrameTransform, FrameTransforms, Grid, LinePrimitive, Log, PackedElementField, Point3, PointCloud,
-    Pose, Quaternion, SceneEntity, SceneUpdate, Timestamp, Vector2, Vector3,
+    Pose, Quaternion, SceneEntity, SceneUpdate, TextPrimitive, Timestamp, Vector2, Vector3,
 };
 use nalgebra::Isometry3;
 
@@ -20,6 +22,12 @@ use clearway_client::MapView;
 const CELL_BYTES: u32 = 4;
 /// Bytes of a point: x, y, z.
 const POINT_BYTES: u32 = 12;
+/// Red, green, blue and opacity of plans: those of the page.
+const PLAN_RGBA: [f32; 4] = [1.0, 0.31, 0.85, 1.0];
+/// Width of a plan's lines, their height over the ground, and the height of its letters, in metres.
+const PLAN_LINE_M: f64 = 0.15;
+const PLAN_LIFT_M: f64 = 0.1;
+const PLAN_LETTER_M: f64 = 0.8;
 
 /// A layer as a coloured grid in the ego frame; a grid along the world's axes keeps these axes.
 pub fn grid(map: &MapView, layer: &Layer, raster: &Raster) -> Grid {
@@ -43,12 +51,12 @@ pub fn grid(map: &MapView, layer: &Layer, raster: &Raster) -> Grid {
 pub fn safe_paths(map: &MapView, layer: &Layer) -> SceneUpdate {
     let header = map.header();
     let valid_ns = header.valid_until_ns.saturating_sub(header.capture_end_ns).max(0);
-    let lines = |points: Vec<Place>, [r, g, b, a]: [f32; 4], thickness: f64| LinePrimitive {
+    let lines = |points: Vec<Place>, rgba: [f32; 4], thickness: f64| LinePrimitive {
         r#type: Type::LineList.into(),
         pose: Some(pose(&Isometry3::identity())),
         thickness,
         points: points.into_iter().map(|[x, y, z]| Point3 { x, y, z }).collect(),
-        color: Some(Color { r: r.into(), g: g.into(), b: b.into(), a: a.into() }),
+        color: Some(color(rgba)),
         ..LinePrimitive::default()
     };
     let links = lines(safe_paths::links(&layer.points), safe_paths::LINK_RGBA, safe_paths::LINK_M);
@@ -60,6 +68,40 @@ pub fn safe_paths(map: &MapView, layer: &Layer) -> SceneUpdate {
         lifetime: Some(Duration::new((valid_ns / 1_000_000_000) as i32, (valid_ns % 1_000_000_000) as u32)),
         frame_locked: true,
         lines: vec![links, circles],
+        ..SceneEntity::default()
+    };
+    SceneUpdate { deletions: Vec::new(), entities: vec![entity] }
+}
+
+/// A plan in its own frame: lines, and its text at the end of the path. The next plan replaces it; it disappears 2 s
+/// after its stamp.
+pub fn plan(vehicle: &str, plan: &v1::Plan) -> SceneUpdate {
+    let colour = || Some(color(PLAN_RGBA));
+    let at = |[x, y]: [f64; 2]| Point3 { x, y, z: PLAN_LIFT_M };
+    let lines = LinePrimitive {
+        r#type: Type::LineList.into(),
+        pose: Some(pose(&Isometry3::identity())),
+        thickness: PLAN_LINE_M,
+        points: plan::lines(plan).into_flattened().into_iter().map(at).collect(),
+        color: colour(),
+        ..LinePrimitive::default()
+    };
+    let (x, y) = (plan.x.last().copied().unwrap_or_default(), plan.y.last().copied().unwrap_or_default());
+    let text = TextPrimitive {
+        pose: Some(pose(&Isometry3::translation(x, y, 1.0))),
+        billboard: true,
+        font_size: PLAN_LETTER_M,
+        color: colour(),
+        text: plan.text.clone(),
+        ..TextPrimitive::default()
+    };
+    let entity = SceneEntity {
+        timestamp: Some(timestamp(plan.stamp_ns)),
+        frame_id: if plan.frame() == v1::PlanFrame::Map { MAP_FRAME.into() } else { base_frame(vehicle) },
+        id: "plan".into(),
+        lifetime: Some(Duration::new((PLAN_DRAWN_NS_MAX / 1_000_000_000) as i32, 0)),
+        lines: vec![lines],
+        texts: if plan.text.is_empty() { Vec::new() } else { vec![text] },
         ..SceneEntity::default()
     };
     SceneUpdate { deletions: Vec::new(), entities: vec![entity] }
@@ -111,6 +153,10 @@ pub fn points(stamp_ns: i64, frame_id: &str, points: impl Iterator<Item = [f32; 
 
 fn field(name: &str, offset: u32, kind: NumericType) -> PackedElementField {
     PackedElementField { name: name.to_owned(), offset, r#type: kind.into() }
+}
+
+fn color([r, g, b, a]: [f32; 4]) -> Color {
+    Color { r: r.into(), g: g.into(), b: b.into(), a: a.into() }
 }
 
 /// A stamp, limited to the range of the message (1970 to 2106).

@@ -5,13 +5,14 @@
 
 use clearway_mapping::event::EgoPose;
 use clearway_proto::map::Layer;
+use clearway_proto::{plan, v1};
 use clearway_ros::OccupancyGrid;
 use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
-use clearway_ros::pose::{Odometry, StampedTransform, Twist, pose_array_to_cdr, tf_message_to_cdr};
+use clearway_ros::pose::{Odometry, StampedTransform, Twist, pose_array_to_cdr, path_to_cdr, tf_message_to_cdr};
 use clearway_ros::published::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::published::{MARKER_ARRAY, OCCUPANCY_GRID, POINT_CLOUD2, POSE_ARRAY, Published};
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use super::aligned::AlignedGrid;
 use super::clouds;
@@ -159,6 +160,15 @@ pub fn odometry_of(frames: &FrameNames, pose: &EgoPose) -> Vec<u8> {
     let transform = StampedTransform { header, child_frame_id: &frames.ego, parent_from_child: pose.map_from_ego };
     let twist = Some(Twist { linear_mps: [pose.speed_mps, 0.0, 0.0], angular_rps: [0.0; 3] });
     Odometry { transform, twist }.to_cdr()
+}
+
+/// A plan in its own frame as a path, on the ground.
+pub fn path_of(frames: &FrameNames, plan: &v1::Plan) -> Vec<u8> {
+    let frame_id = if plan.frame() == v1::PlanFrame::Map { &frames.fixed } else { &frames.ego };
+    let points = plan.x.iter().zip(&plan.y).zip(plan::headings(plan));
+    let rotation = |heading_rad| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading_rad);
+    let pose = |((&x, &y), heading_rad)| Isometry3::from_parts(Translation3::new(x, y, 0.0), rotation(heading_rad));
+    path_to_cdr(&Header { stamp_ns: plan.stamp_ns, frame_id }, &points.map(pose).collect::<Vec<_>>())
 }
 
 /// Transform of a frame in its parent as a tf message.

@@ -1,8 +1,9 @@
-//! The gRPC server: `clearway.v1.MapService` and `clearway.v1.RecordingService`, standard health and reflection, and
+//! The gRPC server: `clearway.v1.MapService`, `PlanService` and `RecordingService`, standard health and reflection, and
 //! the ingest service if it is configured ([`crate::ingest::grpc`]).
 //!
 //! [`listen`](super::listen) accepts the connections and checks who calls. [`reader`] has the updates of one reader.
 
+mod plan;
 pub mod reader;
 mod recording;
 mod replay;
@@ -72,6 +73,7 @@ pub async fn serve<I: IngestService>(
         .register_encoded_file_descriptor_set(DESCRIPTORS)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET);
     let mut routes = Routes::builder();
+    routes.add_service(plan::service(vehicles.clone()));
     routes.add_service(MapServiceServer::new(Maps { vehicles, fleet }).max_decoding_message_size(REQUEST_BYTES_MAX));
     let recordings = RecordingServiceServer::new(Recordings { control: recorder.clone() });
     routes.add_service(recordings.max_decoding_message_size(REQUEST_BYTES_MAX));

@@ -17,6 +17,7 @@ use super::selection::{Selection, Sent};
 use crate::base::clock::now_ns;
 use crate::engine::acknowledgements::{AcknowledgingReader, MapId};
 use crate::engine::newest::Newest;
+use crate::engine::plans::Plans;
 use crate::engine::subscriptions::LayerSubscription;
 use crate::publish::served::{Served, Vehicles};
 use crate::status::{Reader, Transport, VehicleStatus};
@@ -80,6 +81,8 @@ struct Watch<R> {
     /// Until it goes, its layers are made.
     subscription: LayerSubscription,
     status: Arc<VehicleStatus>,
+    /// The plans of the vehicle; `None` if the reader does not want them.
+    plans: Option<Plans>,
     /// When the reader gets the state of the vehicle; `None` if it does not want it.
     states: Option<Interval>,
     transport: Transport,
@@ -108,6 +111,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             subscription: served.wires.subscriptions.subscribe(&selection.layers),
             status: served.status.clone(),
             states: selection.states.then(|| tokio::time::interval(STATE_PERIOD)),
+            plans: selection.plans.then(|| served.wires.plans.clone()),
             transport,
             last: None,
             base: None,
@@ -196,6 +200,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {
+        let plan = self.plans.as_ref().and_then(|plans| plans.over(&map)).map(Box::new);
         let _hop = self.status.traces.hop(&map, "send", Some(self.transport.as_str()));
         let Self { selection, last, base, want_full, .. } = self;
         let is_base = |base: &&EncodedMap| !*want_full && base.boot_id == map.boot_id;
@@ -207,7 +212,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         selection.credits.send(sent.sequence);
         (*base, *want_full) = (selection.deltas.then_some(map), false);
         let lockstep = self.finished.as_ref().is_some_and(AcknowledgingReader::is_in_lockstep);
-        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, lockstep, ..Default::default() })
+        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, lockstep, plan, ..Default::default() })
     }
 }
 

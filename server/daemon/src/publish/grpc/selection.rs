@@ -28,6 +28,8 @@ pub struct Selection {
     pub deltas: bool,
     /// True if the state of the vehicle is sent while no map comes.
     pub states: bool,
+    /// True if the newest plan is sent with each map.
+    pub plans: bool,
     /// Which maps are sent.
     pub rate: Rate,
     /// How many maps may be on the way.
@@ -41,7 +43,7 @@ impl Selection {
     /// `NotFound` for an unknown layer; `InvalidArgument` for a value that is not allowed, or a region outside the
     /// grids. Both name the value and what is allowed.
     pub fn new(served: &Served, selection: v1::Selection) -> Result<Self, Status> {
-        let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas, states } = selection;
+        let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas, states, plans } = selection;
         served.check_layers(&layers)?;
         if max_in_flight > IN_FLIGHT_MAX {
             let text = format!("max_in_flight {max_in_flight}: 0 to {IN_FLIGHT_MAX} is allowed");
@@ -52,6 +54,7 @@ impl Selection {
             region,
             deltas,
             states,
+            plans,
             rate: Rate::new(max_rate_hz)?,
             credits: Credits::new(max_in_flight as usize),
         };

@@ -16,7 +16,7 @@ use crate::config::{self, Only};
 pub enum Role {
     /// May read maps and status.
     Reader,
-    /// May send scans, poses, roads and packets.
+    /// May send scans, poses, roads, packets and plans.
     Ingester,
     /// May do both, and control the recorder and a replay.
     Operator,
@@ -40,6 +40,7 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.MapService/ListVehicles", &[Role::Reader, Role::Ingester]),
     ("/clearway.v1.MapService/WatchStatus", &[Role::Reader, Role::Ingester]),
     ("/clearway.v1.IngestService/Stream", &[Role::Ingester]),
+    ("/clearway.v1.PlanService/Send", &[Role::Ingester]),
     ("/clearway.v1.RecordingService/Start", &[Role::Operator]),
     ("/clearway.v1.RecordingService/Stop", &[Role::Operator]),
     ("/clearway.v1.RecordingService/Split", &[Role::Operator]),
