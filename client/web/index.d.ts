@@ -67,10 +67,21 @@ export class LiveMap {
   layer(name: string): Layer | null;
 }
 
+/** `Plan` of journal.proto, in the ego frame of the map that it came with. */
+export interface Plan {
+  planner: string;
+  x: number[];
+  y: number[];
+  heading_rad: number[];
+  footprint_m: number[];
+  goal: { x: number; y: number } | null;
+  text: string;
+}
+
 /** Opens a `MapUpdate` of MapService. */
 export function openUpdate(
   message: Uint8Array, base?: LiveMap | null,
-): { skipped: bigint; sent_ns: bigint; map: LiveMap };
+): { skipped: bigint; sent_ns: bigint; map: LiveMap; plan: Plan | null };
 
 /** An invalid map. `reason` is the name of the fault in the golden vectors. */
 export class DecodeError extends Error {

@@ -171,7 +171,14 @@ const LAYER = {
 };
 // The layers stay bytes until they are needed.
 const MAP = { 1: ["header", message(HEADER)], 2: ["layers", repeated(bytes)] };
-const MAP_UPDATE = { 1: ["map", bytes], 2: ["skipped", uint64], 3: ["sent_ns", sfixed64] };
+const PLAN = {
+  2: ["planner", string], 7: ["x", repeated(double)], 8: ["y", repeated(double)], 9: ["heading_rad", repeated(double)],
+  10: ["footprint_m", repeated(double)], 11: ["goal", message({ 1: ["x", double], 2: ["y", double] })],
+  12: ["text", string],
+};
+const MAP_UPDATE = {
+  1: ["map", bytes], 2: ["skipped", uint64], 3: ["sent_ns", sfixed64], 8: ["plan", message(PLAN)],
+};
 
 export const readMap = (from) => decode(MAP, from);
 export const readMapUpdate = (from) => decode(MAP_UPDATE, from);

@@ -62,6 +62,18 @@ test("the limits are those of the golden file", () => {
   assert.equal(limits.SAFE_POINT_STEPS_MAX, others.safe_point_steps_max);
 });
 
+test("the plan of an update is read, and an update may have none", () => {
+  const double = (value) => [...new Uint8Array(new Float64Array([value]).buffer)];
+  const field = (number, bytes) => [8 * number + 2, bytes.length, ...bytes];
+  const goal = [0x09, ...double(20), 0x11, ...double(-1)];
+  const text = [...new TextEncoder().encode("blocked")];
+  const plan = [...field(7, [...double(0), ...double(5)]), ...field(8, [...double(0), ...double(1.5)]),
+    ...field(11, goal), ...field(12, text)];
+  const read = readMapUpdate(Uint8Array.from(field(8, plan))).plan;
+  assert.deepEqual([read.x, read.y, read.goal, read.text], [[0, 5], [0, 1.5], { x: 20, y: -1 }, "blocked"]);
+  assert.equal(readMapUpdate(new Uint8Array(0)).plan, null);
+});
+
 test("the golden safe points decode to their places, radii and links", () => {
   const map = new LiveMap(goldenMap("map"));
   const described = golden("map.json").layers.map(({ name, points }) => [name, points]);

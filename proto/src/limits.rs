@@ -1,5 +1,5 @@
-//! Limits of plans, and of the map format: one table for every decoder. `golden/limits.json` is written from it; the Python and
-//! JavaScript decoders compare their limits with that file.
+//! Limits of plans, and of the map format: one table for every decoder. `golden/limits.json` is written from it; the
+//! Python and JavaScript decoders compare their limits with that file.
 
 /// Most cells of one channel: a square of 400 m with cells of 0.2 m. Ours; the default grids have at most 160,000.
 pub const CHANNEL_CELLS_MAX: u32 = 4 << 20;

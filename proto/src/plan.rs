@@ -128,7 +128,8 @@ pub fn check(plan: &Plan, now_ns: i64) -> Result<(), PlanError> {
 
 fn check_numbers(plan: &Plan) -> Result<(), PlanError> {
     let goal = plan.goal.map_or([0.0; 2], |goal| [goal.x, goal.y]);
-    let pose = plan.map_from_ego.map_or([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], |p| [p.x, p.y, p.z, p.qx, p.qy, p.qz, p.qw]);
+    let pose =
+        plan.map_from_ego.map_or([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], |p| [p.x, p.y, p.z, p.qx, p.qy, p.qz, p.qw]);
     let fields: [(_, &[f64]); 6] = [
         ("x", &plan.x),
         ("y", &plan.y),
@@ -146,9 +147,9 @@ fn check_numbers(plan: &Plan) -> Result<(), PlanError> {
     if (length - 1.0).abs() > 0.01 { Err(PlanError::Quaternion { length }) } else { Ok(()) }
 }
 
-/// A plan that was checked, in the ego frame of a map with this stamp and pose, with a heading for each point; `None` if
-/// the stamps differ by more than [`PLAN_DRAWN_NS_MAX`], or if a plan in the world frame has no place in a map without a
-/// pose.
+/// A plan that was checked, in the ego frame of a map with this stamp and pose, with a heading for each point; `None`
+/// if the stamps differ by more than [`PLAN_DRAWN_NS_MAX`], or if a plan in the world frame has no place in a map
+/// without a pose.
 pub fn over(plan: &Plan, capture_end_ns: i64, map_from_ego: Option<&Pose>) -> Option<Plan> {
     if capture_end_ns.abs_diff(plan.stamp_ns) > PLAN_DRAWN_NS_MAX.unsigned_abs() {
         return None;
@@ -203,7 +204,8 @@ pub fn lines(plan: &Plan) -> Vec<[[f64; 2]; 2]> {
     let path: Vec<_> = plan.x.iter().zip(&plan.y).map(|(&x, &y)| [x, y]).collect();
     let mut corners = footprint_at_end(plan);
     corners.extend(corners.first().copied());
-    let mut lines: Vec<_> = [path, corners].iter().flat_map(|of| of.windows(2).map(|ends| [ends[0], ends[1]])).collect();
+    let mut lines: Vec<_> =
+        [path, corners].iter().flat_map(|of| of.windows(2).map(|ends| [ends[0], ends[1]])).collect();
     if let Some(PlanGoal { x, y }) = plan.goal {
         lines.extend([-GOAL_M, GOAL_M].map(|m| [[x - GOAL_M, y - m], [x + GOAL_M, y + m]]));
     }

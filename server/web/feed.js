@@ -4,6 +4,7 @@
 //
 // want: { layers, max_rate_hz, deltas, show: of frame.js, raster: of grid.js, probe: { x, y } or null }.
 
+import { PLAN_COLOUR } from "./draw/palette.js";
 import { cellValues, newFrame } from "./frame.js";
 import { MapStream } from "./map_stream.js";
 
@@ -123,10 +124,11 @@ export class Feed {
     }
     this.#shown = update;
     this.#is_busy = true;
-    const { map, sent_ns, arrived_ms } = update, { counts } = this.#stream;
+    const { map, sent_ns, arrived_ms, plan } = update, { counts } = this.#stream;
+    if (plan) frame.legend = [...frame.legend, [PLAN_COLOUR, `plan ${plan.planner}${plan.text && `: ${plan.text}`}`]];
     this.#emit({
       type: "frame", raster, header: map.header, sent_ns, arrived_ms, length: map.length, names: map.names,
-      counts: { ...counts }, ...frame,
+      counts: { ...counts }, plan, ...frame,
     });
     this.#answerProbe();
   }

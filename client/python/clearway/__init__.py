@@ -17,7 +17,7 @@ from .costmap import OccupancyGrid
 from .errors import ClearwayError, DecodeError, ReplayEnded
 from .freshness import now_ns
 from .grid import CartesianGrid, RadialGrid
-from .ingest import Ingester, Refusal
+from .ingest import Ingester, PlanSender, Refusal
 from .layer import Channel, Layer, LegendEntry, Meaning, SafePoint
 from .map import Map
 from .questions import Along, Answer, Blocker, Obstacle
@@ -31,7 +31,7 @@ from .v1 import map_pb2, service_pb2
 __all__ = [
     "Along", "Answer", "Arc", "Blocker", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Ingester",
     "Layer", "LegendEntry", "Map", "MapStream", "Meaning", "Obstacle", "OccupancyGrid", "Outline", "PassedOver",
-    "RadialGrid", "Recorder", "Refusal", "ReplayEnded", "SafePoint", "Tls", "get", "now_ns", "read", "status",
+    "PlanSender", "RadialGrid", "Recorder", "Refusal", "ReplayEnded", "SafePoint", "Tls", "get", "now_ns", "read", "status",
     "vehicles", "watch",
 ]  # fmt: skip
 

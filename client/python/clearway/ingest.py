@@ -1,4 +1,4 @@
-"""Scans and poses of a vehicle -> a server, over gRPC, and the outcome of each."""
+"""Scans and poses of a vehicle -> a server, over gRPC, and the outcome of each; plans of a planner -> a server."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ import grpc
 import numpy as np
 import numpy.typing as npt
 
+from . import over_zenoh
 from .errors import ClearwayError
+from .map import Map
 from .over_grpc import channel, refused
 from .tls import Tls
 from .v1 import Stub, ingest_pb2, journal_pb2, map_pb2
@@ -22,6 +24,7 @@ from .v1 import Stub, ingest_pb2, journal_pb2, map_pb2
 _IN_FLIGHT_MAX = 16
 _REPORT_TIMEOUT_S = 10.0
 _REFUSALS_MAX = 4096
+_ANSWER_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, order=True)
@@ -160,3 +163,75 @@ class Ingester:
         with self._changed:
             self._ended = ended
             self._changed.notify_all()
+
+
+class PlanSender:
+    """Sends what a planner did with maps to a server at HOST:PORT or zenoh:ENDPOINT, to be recorded and drawn over them;
+    with the role `ingester` if clients have roles.
+
+        with clearway.PlanSender("localhost:50051", planner="lattice") as plans:
+            plans.send(m, path, footprint=[(2, 1), (-2, 1), (-2, -1), (2, -1)], goal=(30, 0), text="blocked by a car")
+
+    Over zenoh a server does not answer: it counts a plan that it refuses as `plan` in its status.
+    """
+
+    def __init__(self, address: str, planner: str = "", tls: Tls | None = None) -> None:
+        self._address, self._planner = address, planner
+        self._session: Any = None
+        self._channel: grpc.Channel | None = None
+        if address.startswith("zenoh:"):
+            self._session = over_zenoh._session(address.removeprefix("zenoh:"), tls)
+        else:
+            self._channel = channel(address, tls)
+            self._send = Stub(self._channel, "PlanService").Send
+
+    def send(
+        self,
+        m: Map,
+        path: npt.ArrayLike,
+        *,
+        heading_rad: npt.ArrayLike = (),
+        footprint: npt.ArrayLike = (),
+        goal: Sequence[float] | None = None,
+        text: str = "",
+    ) -> None:
+        """Sends the path that was planned on `m`: 1 to 4096 points (x, y) of its ego frame, in metres, in driving order,
+        with the heading at each (empty: along the path), the corners (x, y) of the footprint that is kept free, the goal
+        (x, y), and a text such as why the path ends. Raises ClearwayError with the value that is wrong."""
+        xy, corners = np.asarray(path, "<f8"), np.asarray(footprint, "<f8")
+        for name, points in (("path", xy), ("footprint", corners)):
+            if points.size and (points.ndim != 2 or points.shape[1] != 2):
+                raise ClearwayError("plan", f"{name} of shape {points.shape}: (n, 2) is allowed")
+        xy = xy.reshape(-1, 2)
+        plan = journal_pb2.Plan(
+            vehicle=m.vehicle, planner=self._planner, stamp_ns=m.header.capture_end_ns, map_sequence=m.sequence,
+            frame=journal_pb2.PLAN_FRAME_EGO, x=xy[:, 0], y=xy[:, 1], heading_rad=np.asarray(heading_rad, "<f8"),
+            footprint_m=corners.ravel(), text=text,
+        )  # fmt: skip
+        if m.header.HasField("map_from_ego"):
+            plan.map_from_ego.CopyFrom(m.header.map_from_ego)
+        if goal is not None:
+            plan.goal.x, plan.goal.y = goal
+        self.send_plan(plan)
+
+    def send_plan(self, plan: journal_pb2.Plan) -> None:
+        """Sends any plan of journal.proto, such as one in the world frame."""
+        if self._session is not None:
+            over_zenoh.put(self._session, f"clearway/{plan.vehicle}/plan", plan.SerializeToString())
+            return
+        try:
+            self._send(plan, timeout=_ANSWER_TIMEOUT_S)
+        except grpc.RpcError as error:
+            raise refused(self._address, error) from None
+
+    def close(self) -> None:
+        if self._session is not None:
+            self._session.close()
+        if self._channel is not None:
+            self._channel.close()
+
+    def __enter__(self) -> PlanSender:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

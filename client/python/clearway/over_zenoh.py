@@ -106,6 +106,17 @@ def vehicles(endpoint: str, tls: Tls | None) -> list[str]:
         return sorted({str(reply.ok.key_expr).removeprefix("clearway/") for reply in replies if reply.ok})
 
 
+def put(session: zenoh.Session, key: str, payload: bytes) -> None:
+    """Puts a message; with roles the server looks up the certificate of the session that its source info names."""
+    import zenoh
+
+    publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+    try:
+        publisher.put(payload, source_info=zenoh.SourceInfo(source_id=publisher.id, source_sn=0))
+    finally:
+        publisher.undeclare()
+
+
 def _replies(session: zenoh.Session, key: str) -> Iterator[zenoh.Sample]:
     """Every reply of every peer: zenoh would otherwise select one, perhaps that of a peer that is no server."""
     import zenoh

@@ -42,6 +42,34 @@ def test_get_and_watch_return_equal_maps(transport):
         assert (one["drivability"].classes == other["drivability"].classes).all()
 
 
+@pytest.mark.parametrize("address", [GRPC, f"zenoh:{ZENOH}"], ids=["grpc", "zenoh"])
+def test_a_plan_comes_with_the_maps_after_it(address):
+    from clearway.v1 import Stub, service_pb2
+
+    selection = service_pb2.Selection(vehicle="car", layers=["drivability"], plans=True)
+    with clearway.over_grpc.channel(GRPC) as channel, clearway.PlanSender(address, planner="pytest") as plans:
+        updates = Stub(channel, "MapService").Watch(iter([service_pb2.WatchRequest(selection=selection)]))
+        m = clearway.get(GRPC, layers=["drivability"])
+        text = f"blocked, {address}"
+        plans.send(m, [(0, 0), (5, 0.5)], footprint=[(1, 1), (-1, 1), (-1, -1)], goal=(9, 0), text=text)
+        plan = next(update.plan for update in updates if update.plan.text == text)
+        updates.cancel()
+    assert (list(plan.x), plan.goal.x, plan.planner, plan.map_sequence) == ([0, 5], 9, "pytest", m.sequence)
+
+
+def test_a_plan_that_cannot_be_drawn_is_refused_with_its_value():
+    m = clearway.get(GRPC, layers=["drivability"])
+    before = clearway.status(GRPC).observations_refused["plan"]
+    with clearway.PlanSender(GRPC) as plans:
+        for path, said in [([], "path of 0 points"), ([(0, 0), (1, float("nan"))], "NaN"), ([(0, 0)] * 4097, "4097")]:
+            with pytest.raises(clearway.ClearwayError, match=said) as raised:
+                plans.send(m, path)
+            assert raised.value.reason == "INVALID_ARGUMENT"
+        with pytest.raises(clearway.ClearwayError, match=r"path of shape \(3,\)"):
+            plans.send(m, [1.0, 2.0, 3.0])
+    assert clearway.status(GRPC).observations_refused["plan"] == before + 3
+
+
 @pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
 def test_a_slow_loop_body_gets_the_newest_map_and_the_skipped_count(transport):
     with clearway.watch(**transport, layers=["drivability"]) as maps:

@@ -215,7 +215,8 @@ impl Client {
         let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, .. } = subscription;
         let Subscription { replay_clock, reconnects, .. } = subscription;
         let max_in_flight = max_in_flight.max(1);
-        let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, states: true, plans: false };
+        let selection =
+            v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, states: true, plans: false };
         let (mut client, mut opened) = (self.clone(), self.watch(&selection).await?);
         if let Some(server) = self.led_by(opened.as_ref().err()).await? {
             opened = server.watch(&selection).await?;
@@ -250,8 +251,8 @@ impl Client {
         }
     }
 
-    /// Sends what a planner did with a map ([`MapView::plan`]), to be recorded and drawn over the maps. Needs the role of
-    /// an ingester, if clients have roles.
+    /// Sends what a planner did with a map ([`MapView::plan`]), to be recorded and drawn over the maps. Needs the role
+    /// of an ingester, if clients have roles.
     ///
     /// # Errors
     /// [`ClientError::Plan`] if the plan cannot be drawn, [`ClientError::Unreachable`] if the connection fails,

@@ -1,6 +1,7 @@
 //! `clearway export` and `clearway info` read a recording that the test writes.
 
 mod pictures;
+mod plans;
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,8 +17,7 @@ use clearway_sim::vehicle::SimulatedVehicle;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::common::venv;
-use crate::common::{CAPTURE_END_NS, CLASSES, clearway, map, text};
+use crate::common::{CAPTURE_END_NS, CLASSES, clearway, map, text, venv};
 
 /// The map's layer with another name and three safe points: a line to the left of the vehicle, and a branch ahead.
 fn safe_path(mut layer: v1::Layer) -> v1::Layer {

@@ -9,7 +9,7 @@ use super::{folder, record};
 use crate::common::{clearway, text};
 
 /// Width, height, red, green and blue of each pixel, and the texts by keyword, of a picture.
-fn decoded(file: &Path) -> (usize, usize, Vec<[u8; 3]>, BTreeMap<String, String>) {
+pub(super) fn decoded(file: &Path) -> (usize, usize, Vec<[u8; 3]>, BTreeMap<String, String>) {
     let mut reader = png::Decoder::new(BufReader::new(File::open(file).unwrap())).read_info().unwrap();
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
     let info = reader.next_frame(&mut pixels).unwrap();

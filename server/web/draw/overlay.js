@@ -1,6 +1,7 @@
-// What is drawn over a map: range rings, the vehicle, its trail, safe paths, the cell under the cursor. In: a pen whose
+// What is drawn over a map: range rings, the vehicle, its trail, safe paths, a plan, the cell under the cursor. In: a pen whose
 // unit is a CSS pixel, and a view (vehicle/view.js).
 
+import { css, PLAN_COLOUR } from "./palette.js";
 import { egoFrom, toPixel } from "../vehicle/view.js";
 
 const RINGS_M = [5, 10, 20, 40, 60, 80];
@@ -13,6 +14,8 @@ const VEHICLE_PX_MIN = 12;
 const BAND = "rgb(255 255 255 / 20%)", EDGE = "rgb(255 255 255 / 55%)";
 // A line is drawn twice, dark and then light, so that it is seen on every colour.
 const PATH = [["rgb(10 14 18 / 85%)", 4.5], ["#ffe14d", 2]], TRAIL = [["rgb(10 14 18 / 70%)", 4], ["#7fd6ff", 1.75]];
+// Half the width of the cross at a plan's goal.
+const GOAL_M = 0.75;
 // Every so many safe points, the circle itself is drawn. The points lie a cell apart, 0.25 m by default.
 const CIRCLE_EVERY = 16;
 
@@ -109,6 +112,26 @@ export function drawSafePoints(pen, view, size, points) {
   pen.lineWidth = 0.75;
   pen.stroke(circles);
   strokeTwice(pen, lines, PATH);
+}
+
+// plan: of a MapUpdate; null draws nothing. Its path, its footprint at the end, and a cross at its goal.
+export function drawPlan(pen, view, size, plan) {
+  if (!plan) return;
+  const lines = new Path2D(), { x, y, heading_rad, footprint_m, goal } = plan;
+  const at = (x, y) => Object.values(toPixel(view, size, x, y));
+  const to = (i, x, y) => (i ? lines.lineTo(...at(x, y)) : lines.moveTo(...at(x, y)));
+  x.forEach((x, i) => to(i, x, y[i]));
+  const end = x.length - 1, [sin, cos] = [Math.sin(heading_rad[end]), Math.cos(heading_rad[end])];
+  for (let i = 0; i < footprint_m.length; i += 2) {
+    const [forward, left] = [footprint_m[i], footprint_m[i + 1]];
+    to(i, x[end] + cos * forward - sin * left, y[end] + sin * forward + cos * left);
+  }
+  if (footprint_m.length) lines.closePath();
+  for (const side of goal ? [-GOAL_M, GOAL_M] : []) {
+    lines.moveTo(...at(goal.x - GOAL_M, goal.y - side));
+    lines.lineTo(...at(goal.x + GOAL_M, goal.y + side));
+  }
+  strokeTwice(pen, lines, [["rgb(10 14 18 / 85%)", 4.5], [css(PLAN_COLOUR), 2.25]]);
 }
 
 export function drawProbe(pen, view, size, probe) {

@@ -3,6 +3,9 @@
 // The colour of unknown cells in a layer without classes.
 export const UNKNOWN = [58, 63, 70];
 
+// The colour of a plan, which no class has.
+export const PLAN_COLOUR = [255, 79, 216];
+
 // Colours from blue, lighter than unknown cells, to light yellow, even in lightness, for colour-blind eyes and in grey;
 // t from 0 to 1. Exported pictures have the same (server/daemon/src/encode/palette.rs).
 const STOPS = [[48, 88, 184], [100, 120, 150], [150, 154, 140], [206, 192, 112], [254, 232, 90]];

@@ -2,7 +2,7 @@
 // While the view moves, the last frame moves with it; the Worker sends a sharp one soon after. Out: calls to `on`:
 // view() after each change of the view or the size, probe({ x, y } or null).
 
-import { drawOutline, drawProbe, drawRings, drawSafePoints, drawTrail } from "../draw/overlay.js";
+import { drawOutline, drawPlan, drawProbe, drawRings, drawSafePoints, drawTrail } from "../draw/overlay.js";
 import { fit, moveInto, pan, place, rasterOf, toEgo, zoomAt } from "./view.js";
 
 // More pixels a side show no more of a grid, and cost time for each map.
@@ -22,7 +22,7 @@ export class MapCanvas {
   // Radius that the view is fitted to until the user moves it; null afterwards.
   #fitted_m = 0;
   #is_scheduled = false;
-  #layers = { outline: [], trail: [], pose: null, safe_points: null };
+  #layers = { outline: [], trail: [], pose: null, safe_points: null, plan: null };
 
   constructor(canvas, on) {
     this.#canvas = canvas;
@@ -86,11 +86,12 @@ export class MapCanvas {
       pen.imageSmoothingEnabled = false;
       pen.drawImage(this.#picture, ...place(this.#frame.raster, this.view, this.size));
     }
-    const { outline, trail, pose, safe_points } = this.#layers;
+    const { outline, trail, pose, safe_points, plan } = this.#layers;
     if (pose) drawTrail(pen, this.view, this.size, trail, pose);
     drawSafePoints(pen, this.view, this.size, safe_points);
     drawRings(pen, this.view, this.size);
     drawOutline(pen, this.view, this.size, outline);
+    drawPlan(pen, this.view, this.size, plan);
     drawProbe(pen, this.view, this.size, this.probe);
   }
 

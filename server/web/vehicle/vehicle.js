@@ -179,6 +179,7 @@ export class VehicleView {
     this.#map.show(this.#shown, {
       ...vehicle,
       safe_points: this.#settings.safe_points ? (this.#shown?.safe_points ?? null) : null,
+      plan: this.#shown?.plan ?? null,
     });
     const label = this.#shown?.base ? `${words(this.#shown.base.layer)} around the vehicle, forward up` : "No map yet";
     if ($("map").getAttribute("aria-label") !== label) $("map").setAttribute("aria-label", label);

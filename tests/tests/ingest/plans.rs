@@ -148,7 +148,9 @@ async fn a_plan_over_zenoh_is_taken_or_counted() {
     until("the plan is taken", || plans.borrow().as_deref() == Some(&good)).await;
     let mut config = zenoh::Config::default();
     let endpoint = format!("[{:?}]", running.zenoh[0]);
-    for (key, value) in [("mode", "'client'"), ("scouting/multicast/enabled", "false"), ("connect/endpoints", &endpoint)] {
+    for (key, value) in
+        [("mode", "'client'"), ("scouting/multicast/enabled", "false"), ("connect/endpoints", &endpoint)]
+    {
         config.insert_json5(key, value).unwrap();
     }
     let session = within("zenoh", async { zenoh::open(config).await }).await.unwrap();

@@ -38,6 +38,7 @@ in_a_browser! {
     a_drive_is_shown_in_3d_with_its_points => space::a_drive_is_shown_in_3d,
     a_cell_on_the_page_has_the_values_that_a_client_reads => replayed::cells_are_those_of_the_client,
     a_viewed_drive_is_recorded_and_not_stale_and_steps => replayed::a_viewed_drive_steps,
+    a_plan_is_drawn_over_the_map => replayed::a_plan_is_drawn,
     the_time_bar_steps_and_seeks_a_replay => replayed::the_time_bar_controls_a_replay,
     a_map_that_no_longer_comes_is_stale_with_its_true_age => fleet::a_stopped_vehicle_is_stale,
     vehicles_of_other_servers_are_on_the_page => fleet::other_servers_are_shown,

@@ -88,6 +88,39 @@ pub fn cells_are_those_of_the_client() {
     });
 }
 
+/// Number of pixels of the map in the colour of plans.
+const PLAN_PIXELS: &str = "const map = document.getElementById('map');
+    const { data } = map.getContext('2d').getImageData(0, 0, map.width, map.height);
+    let pixels = 0;
+    for (let i = 0; i < data.length; i += 4) {
+        if (data[i] === 255 && data[i + 1] === 79 && data[i + 2] === 216) pixels++;
+    }
+    return pixels";
+
+pub fn a_plan_is_drawn() {
+    beside_a_replay(async |browser, client| {
+        let map = stop_at(client, 0.5).await;
+        await_map(browser, map.sequence());
+        assert_eq!(browser.run(PLAN_PIXELS), 0, "no plan was sent");
+        let plan = v1::Plan {
+            footprint_m: vec![2.0, 1.0, -2.0, 1.0, -2.0, -1.0, 2.0, -1.0],
+            goal: Some(v1::PlanGoal { x: 30.0, y: 8.0 }),
+            text: "blocked by a wall".into(),
+            ..map.plan("tester", &[[0.0, 0.0], [10.0, 0.0], [20.0, 6.0]])
+        };
+        client.send_plan(&plan).await.expect("it is taken");
+        browser.click("[data-part=step]");
+        await_map(browser, map.sequence() + 1);
+        browser.until("the plan", &format!("const pixels = (() => {{ {PLAN_PIXELS} }})(); return pixels > 100"));
+        browser.until(
+            "its words",
+            "return document.querySelector('[data-part=legend]').textContent.includes('plan tester: blocked by a wall')",
+        );
+        browser.screenshot("plan-1440x900");
+        stop_at(client, 0.1).await;
+    });
+}
+
 pub fn the_time_bar_controls_a_replay() {
     beside_a_replay(async |browser, client| {
         let first = stop_at(client, 0.3).await;

@@ -172,16 +172,11 @@ struct VehicleChannels {
 impl VehicleChannels {
     fn new(served: &Served, number: &mut u64, published: Arc<watch::Sender<u64>>) -> Self {
         let vehicle = &served.status.name;
-        let mut kinds: Vec<(String, Kind)> = Vec::new();
-        for &layer in &served.status.layers {
-            kinds.push((format!("/{vehicle}/map/{layer}"), Kind::Layer(layer)));
-        }
-        if served.status.layers.contains(&safe_paths::LAYER) {
-            kinds.push((format!("/{vehicle}/safe_points"), Kind::SafePoints));
-        }
-        kinds.push((format!("/{vehicle}/log"), Kind::Log));
-        kinds.push((format!("/{vehicle}/plan"), Kind::Plan));
-        kinds.push((format!("/{vehicle}/points"), Kind::Points));
+        let (of, layers) = (|name: &str| format!("/{vehicle}/{name}"), &served.status.layers);
+        let mut kinds: Vec<_> = layers.iter().map(|&name| (of(&format!("map/{name}")), Kind::Layer(name))).collect();
+        kinds.extend(layers.contains(&safe_paths::LAYER).then(|| (of("safe_points"), Kind::SafePoints)));
+        let others = [("plan", Kind::Plan), ("log", Kind::Log), ("points", Kind::Points)];
+        kinds.extend(others.map(|(name, kind)| (of(name), kind)));
         kinds.push(("/tf".to_owned(), Kind::Transforms));
         let channel = |(topic, kind)| {
             *number += 1;

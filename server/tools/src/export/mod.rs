@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`layer_json`] | a layer -> JSON |
 //! | [`npy`] | the cells of a channel -> a NumPy file |
+//! | `plans` | the events of a recording -> the plans of the vehicle's planners |
 //! | `scans` | the events of a recording -> the points of each scan |
 //! | `viewer_file` | maps, points -> an MCAP file for viewers |
 
@@ -16,13 +17,14 @@ use clearway_client::{Layer, MapView, v1};
 use clearway_daemon::base::files;
 use clearway_journal::mcap_reader::{McapReader, Message};
 use clearway_proto::plan;
-use prost::Message as _;
 
+use self::plans::plan_of;
 use self::viewer_file::{Dialect, ViewerFile};
 use crate::picture::{self, PictureStyle};
 
 pub mod layer_json;
 pub mod npy;
+mod plans;
 mod scans;
 mod viewer_file;
 
@@ -211,7 +213,11 @@ pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Re
                 let names: Vec<String> = vehicles.into_iter().collect();
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), names.join(" and "))
             }
-            None => write_files(&format!("{:06}_{name}", map.sequence()), options.encode(&map, layer, style, plans.get(&Some(vehicle.to_owned())))?, out)?,
+            None => write_files(
+                &format!("{:06}_{name}", map.sequence()),
+                options.encode(&map, layer, style, plans.get(&Some(vehicle.to_owned())))?,
+                out,
+            )?,
         }
         *exported.maps.entry(name.to_owned()).or_default() += 1;
     }
@@ -222,15 +228,6 @@ pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Re
         bail!("{}", options.nothing(&recording, None));
     }
     Ok(Exported { incomplete: recording.incomplete(), ..exported })
-}
-
-/// The plan of an event of a journal that can be drawn.
-fn plan_of(message: &Message) -> Option<v1::Plan> {
-    message.journal_of()?;
-    match v1::Event::decode(message.data.clone()).ok()?.body? {
-        v1::event::Body::Plan(plan) if plan::check(&plan, plan.stamp_ns).is_ok() => Some(*plan),
-        _ => None,
-    }
 }
 
 /// Writes the files of one layer to the folder `out`; `stem` is the beginning of their names.

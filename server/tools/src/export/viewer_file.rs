@@ -28,7 +28,7 @@ use mcap::records::MessageHeader;
 use prost::Message as _;
 use serde::Deserialize;
 
-use super::plan_of;
+use super::plans::plan_of;
 use super::scans::{DecodedScan, ScanDecoder, ScanPoints};
 use clearway_daemon::base::files;
 use clearway_journal::mcap_file::CHUNK_NS;

@@ -9,7 +9,7 @@ use clearway_proto::{plan, v1};
 use clearway_ros::OccupancyGrid;
 use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
-use clearway_ros::pose::{Odometry, StampedTransform, Twist, pose_array_to_cdr, path_to_cdr, tf_message_to_cdr};
+use clearway_ros::pose::{Odometry, StampedTransform, Twist, path_to_cdr, pose_array_to_cdr, tf_message_to_cdr};
 use clearway_ros::published::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::published::{MARKER_ARRAY, OCCUPANCY_GRID, POINT_CLOUD2, POSE_ARRAY, Published};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
