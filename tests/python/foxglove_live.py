@@ -66,7 +66,7 @@ async def main(url):
         await stalled.send(json.dumps({"op": "subscribe", "subscriptions": everything}))
 
         # The server reads subscriptions in order: the points are subscribed when messages of later subscriptions come.
-        now = ["/car/map/drivability", "/car/map/occupancy", "/car/safe_points", "/car/log", "/tf"]
+        now = ["/car/map/drivability", "/car/map/occupancy", "/car/safe_points", "/car/plan", "/car/log", "/tf"]
         for topic in [LATER, *now]:
             await subscribe(topic)
         received = await receive(socket, decoders, {ids[topic] for topic in now})

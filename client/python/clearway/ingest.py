@@ -195,9 +195,9 @@ class PlanSender:
         goal: Sequence[float] | None = None,
         text: str = "",
     ) -> None:
-        """Sends the path that was planned on `m`: 1 to 4096 points (x, y) of its ego frame, in metres, in driving order,
-        with the heading at each (empty: along the path), the corners (x, y) of the footprint that is kept free, the goal
-        (x, y), and a text such as why the path ends. Raises ClearwayError with the value that is wrong."""
+        """Sends the path that was planned on `m`: 1 to 4096 points (x, y) of its ego frame, in metres, in driving
+        order, with the heading at each (empty: along the path), the corners (x, y) of the footprint that is kept free,
+        the goal (x, y), and a text such as why the path ends. Raises ClearwayError with the value that is wrong."""
         xy, corners = np.asarray(path, "<f8"), np.asarray(footprint, "<f8")
         for name, points in (("path", xy), ("footprint", corners)):
             if points.size and (points.ndim != 2 or points.shape[1] != 2):

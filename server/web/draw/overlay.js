@@ -1,5 +1,5 @@
-// What is drawn over a map: range rings, the vehicle, its trail, safe paths, a plan, the cell under the cursor. In: a pen whose
-// unit is a CSS pixel, and a view (vehicle/view.js).
+// What is drawn over a map: range rings, the vehicle, its trail, safe paths, a plan, the cell under the cursor.
+// In: a pen whose unit is a CSS pixel, and a view (vehicle/view.js).
 
 import { css, PLAN_COLOUR } from "./palette.js";
 import { egoFrom, toPixel } from "../vehicle/view.js";

@@ -72,6 +72,8 @@ enum Attempt {
     Liveliness(&'static str),
     /// Sends an observation on a key over zenoh, of which the server gives an account.
     Observe(&'static str),
+    /// Sends a plan over zenoh that the server takes.
+    Plan,
     /// Puts a sample on a key over zenoh that a reader of the server then receives.
     Forge(&'static str),
     /// Requests a path of a listener.
@@ -109,6 +111,7 @@ fn rows() -> Vec<(String, Attempt)> {
         row("zenoh, put `clearway/car/ingest/packet/top`", Attempt::Observe("packet/top")),
         row("zenoh, put `clearway/car/ingest/sensor/new`", Attempt::Observe("sensor/new")),
         row("zenoh, put `clearway/car/ingest/end/top`", Attempt::Observe("end/top")),
+        row("zenoh, put `clearway/car/plan`", Attempt::Plan),
         row("zenoh, put `clearway/car/map/drivability`", Attempt::Forge("clearway/car/map/drivability")),
         row("zenoh, put `clearway/car/status`", Attempt::Forge("clearway/car/status")),
         row("zenoh, put `clearway/**`", Attempt::Forge("clearway/**")),
@@ -174,6 +177,15 @@ impl Bed {
                     return;
                 }
             },
+            (Attempt::Plan, Some(session)) => {
+                let plans = self.running.vehicles.0[0].wires.plans.subscribe();
+                let plan = v1::Plan { frame: 1, x: vec![id as f64], y: vec![0.0], ..Default::default() };
+                while plans.borrow().as_ref().is_none_or(|newest| newest.x != plan.x) {
+                    let put = session.put("clearway/car/plan", plan.encode_to_vec());
+                    put.source_info(SourceInfo::new(session.id(), 0)).await.unwrap();
+                    pause().await;
+                }
+            }
             (Attempt::Forge(key), Some(session)) => loop {
                 let false_sample = format!("forged {id}").into_bytes();
                 session.put(*key, false_sample.clone()).await.unwrap();

@@ -12,6 +12,7 @@ use clearway_daemon::encode::viewer::aligned::AlignedGrid;
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::run::{Running, Server, Setup};
 use clearway_mapping::event::{Body, EgoPose};
+use clearway_proto::v1;
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
 use zenoh::handlers::FifoChannelHandler;
@@ -211,6 +212,8 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
     running.vehicles.0[0].wires.replay_ended.send_replace(true);
     let address = format!("ws://{}", running.foxglove.expect("Foxglove is served"));
     let map = newest(&running);
+    let plans = &running.vehicles.0[0].wires.plans;
+    plans.send(&v1::Plan { text: "blocked".into(), ..map.plan("tester", &[[0.0, 0.0], [5.0, 1.0]]) }).unwrap();
 
     let (mut client, mut lines) = tokio::task::spawn_blocking(move || {
         let mut client = venv::script("foxglove_live.py").arg(address).stdout(Stdio::piped()).spawn().unwrap();
@@ -223,7 +226,7 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
         tokio::task::spawn_blocking(move || (lines.next().expect("a line").unwrap(), lines)).await.unwrap();
     let newest_map: Value = serde_json::from_str(&newest_map).unwrap();
     assert_eq!(newest_map["name"], "clearway");
-    assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 4);
+    assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 5);
     assert_eq!(newest_map["channels"]["/car/log"], "foxglove.Log");
     assert_eq!(newest_map["/car/log"]["message"], "the replay has ended");
     for name in ["drivability", "occupancy"] {
@@ -235,6 +238,9 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
         assert_eq!((&grid["column_count"], &grid["row_stride"]), (&json!(raster.width), &json!(4 * raster.width)));
         assert_eq!(grid["data"], json!({"length": data.len(), "crc32": crc32fast::hash(&data)}), "{name}");
     }
+    let plan = &newest_map["/car/plan"]["entities"][0];
+    assert_eq!((&plan["frame_id"], &plan["texts"][0]["text"]), (&json!("car/base_link"), &json!("blocked")));
+    assert_eq!(plan["lines"][0]["points"].as_array().unwrap().len(), 2, "one straight line");
     let (scene, points) = (&newest_map["/car/safe_points"], &map.layer("safe_path").unwrap().points);
     assert_eq!(newest_map["channels"]["/car/safe_points"], "foxglove.SceneUpdate");
     let (entity, links) = (&scene["entities"][0], points.iter().map(|point| point.links.len()).sum::<usize>());

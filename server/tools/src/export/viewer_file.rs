@@ -1,12 +1,13 @@
 //! A recording -> one MCAP file that viewers open without a plug-in.
 //!
 //! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`),
-//! `/<vehicle>/plan` (the same), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf` (`foxglove.FrameTransforms`). ros2:
-//! `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the layer's other topics ([`ros::topics_of`]),
-//! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
-//! (`nav_msgs/msg/Odometry`), `/clearway/<vehicle>/plan` (`nav_msgs/msg/Path`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording,
-//! and the stamp of the capture's or the scan's end. With points the poses of ros2 are the recorded ones with their own
-//! stamps, so that a replay of the file has the poses of the drive; without points they are the poses of the maps.
+//! `/<vehicle>/plan` (the same), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf`
+//! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the layer's other
+//! topics ([`ros::topics_of`]), `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`),
+//! `/clearway/<vehicle>/odometry` (`nav_msgs/msg/Odometry`), `/clearway/<vehicle>/plan` (`nav_msgs/msg/Path`) and `/tf`
+//! (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording, and the stamp of the capture's or the
+//! scan's end. With points the poses of ros2 are the recorded ones with their own stamps, so that a replay of the file
+//! has the poses of the drive; without points they are the poses of the maps.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs::File;
@@ -86,7 +87,8 @@ impl ViewerFile {
         })
     }
 
-    /// Writes the plan of an event; with points, the points of the scan that it completes, or its pose; `header` is the recording's.
+    /// Writes the plan of an event; with points, the points of the scan that it completes, or its pose; `header` is the
+    /// recording's.
     ///
     /// # Errors
     /// If the event or the header is wrong, or the file cannot be written.
