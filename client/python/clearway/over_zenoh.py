@@ -110,11 +110,8 @@ def put(session: zenoh.Session, key: str, payload: bytes) -> None:
     """Puts a message; with roles the server looks up the certificate of the session that its source info names."""
     import zenoh
 
-    publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-    try:
+    with session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP) as publisher:
         publisher.put(payload, source_info=zenoh.SourceInfo(source_id=publisher.id, source_sn=0))
-    finally:
-        publisher.undeclare()
 
 
 def _replies(session: zenoh.Session, key: str) -> Iterator[zenoh.Sample]:

@@ -39,4 +39,4 @@ def test_each_program_of_the_readme_prints_what_it_should(number, tmp_path):
 
 
 def test_the_readme_has_a_program_for_each_source_of_maps():
-    assert len(PROGRAMS) == 7
+    assert len(PROGRAMS) == 8

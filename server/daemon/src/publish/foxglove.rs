@@ -3,8 +3,8 @@
 //! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`: lines and
 //! circles of the layer `safe_path`), `/<vehicle>/plan` (the same: the newest plan), `/<vehicle>/log` (`foxglove.Log`:
 //! the end of a replay), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest map was made from) and `/tf`
-//! (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels of maps without a subscription are not made; a
-//! message is encoded once for all clients. A new subscription gets the newest map at once. A slow client skips
+//! (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels of maps without a subscription are not made;
+//! a message is encoded once for all clients. A new subscription gets the newest map at once. A slow client skips
 //! messages, and one that receives nothing for [`SEND_TIMEOUT`] is disconnected.
 
 use std::collections::BTreeMap;

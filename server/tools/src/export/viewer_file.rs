@@ -2,8 +2,8 @@
 //!
 //! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`),
 //! `/<vehicle>/plan` (the same), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf`
-//! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the layer's other
-//! topics ([`ros::topics_of`]), `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`),
+//! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the layer's
+//! other topics ([`ros::topics_of`]), `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`),
 //! `/clearway/<vehicle>/odometry` (`nav_msgs/msg/Odometry`), `/clearway/<vehicle>/plan` (`nav_msgs/msg/Path`) and `/tf`
 //! (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording, and the stamp of the capture's or the
 //! scan's end. With points the poses of ros2 are the recorded ones with their own stamps, so that a replay of the file
