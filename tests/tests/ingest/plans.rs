@@ -1,5 +1,6 @@
 //! Plans of planners: taken, recorded beside the maps, shown with the maps, and refused with their values.
 
+use clearway_client::test::Replay;
 use clearway_client::{Client, ClientError, MapView, PlanError, Subscription, ZenohClient, now_ns};
 use clearway_daemon::record::verify;
 use clearway_daemon::run::Running;
@@ -8,6 +9,7 @@ use clearway_mapping::event::Body;
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::plan_service_client::PlanServiceClient;
+use futures::{StreamExt, stream};
 use prost::Message;
 use tonic::Code;
 use tonic::transport::Channel;
@@ -38,6 +40,13 @@ fn refused(running: &Running) -> u64 {
     running.vehicles.0[0].status.to_proto().observations_refused.get("plan").copied().unwrap_or_default()
 }
 
+async fn watch_with_plans(channel: Channel) -> tonic::Streaming<v1::MapUpdate> {
+    let selection = v1::Selection { plans: true, ..Default::default() };
+    let request = v1::WatchRequest { selection: Some(selection), ..Default::default() };
+    let requests = stream::iter([request]).chain(stream::pending());
+    within("a stream", MapServiceClient::new(channel).watch(requests)).await.unwrap().into_inner()
+}
+
 /// The next map, with the plan that came with it.
 async fn next(updates: &mut tonic::Streaming<v1::MapUpdate>) -> (MapView, Option<Box<v1::Plan>>) {
     let update = within("a map", updates.message()).await.unwrap().unwrap();
@@ -59,12 +68,8 @@ async fn a_plan_comes_with_the_maps_after_it_and_changes_no_byte_of_them() {
 
     let running = start(config(), &with_plans).await;
     let client = client(&running).await;
-    let selection = v1::Selection { plans: true, ..Default::default() };
-    let request = v1::WatchRequest { selection: Some(selection), ..Default::default() };
-    let mut maps = MapServiceClient::new(channel(&running).await);
-    let requests = futures::StreamExt::chain(futures::stream::iter([request]), futures::stream::pending());
     feed(&running, first).await;
-    let mut updates = within("a stream", maps.watch(requests)).await.unwrap().into_inner();
+    let mut updates = watch_with_plans(channel(&running).await).await;
     let (map, plan) = next(&mut updates).await;
     assert_eq!(plan, None, "none was sent");
     let sent = ahead(&map);
@@ -93,7 +98,25 @@ async fn a_plan_comes_with_the_maps_after_it_and_changes_no_byte_of_them() {
             _ => None,
         })
         .collect();
-    assert_eq!(plans, [sent]);
+    assert_eq!(plans, std::slice::from_ref(&sent));
+
+    // The replay shows it too, with its stamps.
+    let replay = Replay::start(&with_plans).unwrap();
+    let channel = Channel::from_shared(format!("http://{}", replay.grpc)).unwrap().connect().await.unwrap();
+    let mut updates = watch_with_plans(channel).await;
+    let mut replayed = replay.client().await.unwrap().subscribe(Subscription::default()).await.unwrap();
+    let (map, plan) = loop {
+        let (map, plan) = next(&mut updates).await;
+        if let Some(plan) = plan {
+            break (map, plan);
+        }
+    };
+    assert_eq!((&plan.x, plan.map_sequence), (&sent.x, sent.map_sequence));
+    let header = map.header();
+    let shift_ns = header.replay.expect("a replay as live").shift_ns;
+    assert_eq!(plan.stamp_ns - sent.stamp_ns, shift_ns);
+    assert!(map.sequence() > sent.map_sequence.unwrap());
+    within("a map", replayed.next()).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]

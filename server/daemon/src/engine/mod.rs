@@ -116,8 +116,9 @@ impl Engine {
     }
 
     /// Publishes the newest map of a pipeline that was exchanged, or stepped without publishing; if it has none,
-    /// readers have none.
+    /// readers have none. They have no plan until the next one.
     pub fn publish_newest_map(&mut self) {
+        self.wires.plans.forget();
         if self.pipeline.newest_map().is_none() {
             self.newest.send_replace(None);
             self.wires.sweeps.send_replace(None);

@@ -93,6 +93,11 @@ impl Plans {
         }
     }
 
+    /// Shows no plan until the next one: a replay jumps.
+    pub(super) fn forget(&self) {
+        self.newest.send_replace(None);
+    }
+
     /// The newest plan, and the next ones.
     pub fn subscribe(&self) -> watch::Receiver<NewestPlan> {
         self.newest.subscribe()
