@@ -22,7 +22,10 @@ namespace codec {
 
 enum Encoding : std::int32_t { RAW = 1, ROWS = 2, CHANGES = 3 };
 
-[[noreturn]] inline void refuse(const std::string& what) { throw Error("cells", what); }
+template <class... Parts>
+void check(bool is_met, const Parts&... parts) {
+    require(is_met, "cells", parts...);
+}
 
 inline std::size_t bytes_of(CellType type) { return type == CellType::U16 ? 2 : 1; }
 
@@ -70,7 +73,7 @@ public:
     Bits(Bytes payload, CellType type) : payload_(payload), type_(type) {}
 
     bool bit() {
-        if (at_ / 8 >= payload_.size()) refuse("the payload ends inside the cells, after " + length() + " bytes");
+        check(at_ / 8 < payload_.size(), "the payload ends inside the cells, after ", payload_.size(), " bytes");
         const bool bit = static_cast<unsigned char>(payload_[at_ / 8]) >> (7 - at_ % 8) & 1;
         ++at_;
         return bit;
@@ -79,9 +82,7 @@ public:
     // A number in exp-Golomb code of an order: code `N` if that is 0.
     std::uint64_t number(unsigned order = 0) {
         unsigned bits = order;
-        while (!bit()) {
-            if (++bits > NUMBER_BITS_MAX) refuse("a number exceeds " + std::to_string(NUMBER_BITS_MAX) + " bits");
-        }
+        while (!bit()) check(++bits <= NUMBER_BITS_MAX, "a number exceeds ", NUMBER_BITS_MAX, " bits");
         std::uint64_t number = 1;
         for (unsigned index = 0; index < bits; ++index) number = number << 1 | static_cast<std::uint64_t>(bit());
         return number - (std::uint64_t{1} << order);
@@ -99,69 +100,42 @@ public:
     // A cell of the payload's type from its number on the wire.
     std::int32_t cell(std::uint64_t number) const {
         const std::uint64_t most = type_ == CellType::U16 ? 0xffff : 0xff;
-        if (number > most) refuse("a cell has the number " + std::to_string(number) + "; at most " +
-                                  std::to_string(most) + " is allowed");
+        check(number <= most, "a cell has the number ", number, "; at most ", most, " is allowed");
         const auto value = static_cast<std::int32_t>(number);
         return type_ == CellType::I8 ? (value >> 1 ^ -(value & 1)) : value;
     }
 
     // Checks that nothing follows but zeros that fill the last byte.
     void finish() {
-        while (at_ % 8 != 0) {
-            if (bit()) refuse("a 1 follows the cells; zeros fill the last byte");
-        }
-        if (at_ / 8 != payload_.size()) {
-            refuse(std::to_string(payload_.size() - at_ / 8) + " bytes follow the cells; 0 are allowed");
-        }
+        while (at_ % 8 != 0) check(!bit(), "a 1 follows the cells; zeros fill the last byte");
+        check(at_ / 8 == payload_.size(), payload_.size() - at_ / 8, " bytes follow the cells; 0 are allowed");
     }
 
 private:
-    std::string length() const { return std::to_string(payload_.size()); }
-
     Bytes payload_;
     CellType type_;
     std::size_t at_ = 0;
 };
 
-inline std::size_t checked_length(std::uint64_t length, std::size_t left) {
-    if (length > left) {
-        refuse("a length of " + std::to_string(length) + " cells; " + std::to_string(left) + " are left");
-    }
-    return static_cast<std::size_t>(length);
-}
-
-// Reads `ENCODING_ROWS`: copies of the row before and runs of one value, in turn. `copy` and `run` get the first cell
-// and the length; `run` also gets whether the value of the cell before repeats, and else the value.
-template <class Copy, class Run>
-void read_rows(Bits bits, std::size_t count, Copy copy, Run run) {
-    for (std::size_t at = 0; at < count;) {
-        const std::size_t copied = checked_length(bits.number(), count - at);
-        copy(at, copied);
-        at += copied;
-        if (at == count) break;
-        const bool repeats_before = bits.bit();
-        if (repeats_before && at == 0) refuse("the first cell is as the cell before it; there is none");
-        const std::int32_t value = repeats_before ? 0 : bits.cell(bits.number());
-        const std::size_t length = checked_length(bits.number() + 1, count - at);
-        run(at, length, repeats_before, value);
-        at += length;
+// Decodes `ENCODING_ROWS`: copies of the row before and runs of one value, in turn.
+inline Cells rows(Bits bits, std::size_t count, std::size_t columns) {
+    Cells cells;
+    const auto checked = [&](std::uint64_t length) {
+        const std::size_t left = count - cells.size();
+        check(length <= left, "a length of ", length, " cells; ", left, " are left");
+        return static_cast<std::size_t>(length);
+    };
+    while (cells.size() < count) {
+        for (std::size_t left = checked(bits.number()); left > 0; --left) {
+            cells.push_back(cells.size() < columns ? 0 : cells[cells.size() - columns]);
+        }
+        if (cells.size() == count) break;
+        const bool repeats = bits.bit();
+        check(!repeats || !cells.empty(), "the first cell is as the cell before it; there is none");
+        const std::int32_t value = repeats ? cells.back() : bits.cell(bits.number());
+        cells.insert(cells.end(), checked(bits.number() + 1), value);
     }
     bits.finish();
-}
-
-inline Cells rows(const Bits& bits, std::size_t count, std::size_t columns) {
-    // The lengths are checked before memory is allocated: a few bytes can claim millions of cells.
-    read_rows(bits, count, [](auto, auto) {}, [](auto, auto, auto, auto) {});
-    Cells cells(count);
-    read_rows(
-        bits, count,
-        [&](std::size_t at, std::size_t length) {
-            for (std::size_t end = at + length; at < end; ++at) cells[at] = at < columns ? 0 : cells[at - columns];
-        },
-        [&](std::size_t at, std::size_t length, bool repeats_before, std::int32_t value) {
-            std::fill_n(cells.begin() + static_cast<std::ptrdiff_t>(at), length,
-                        repeats_before ? cells[at - 1] : value);
-        });
     return cells;
 }
 
@@ -212,9 +186,7 @@ inline Cells changes(Bits bits, Cells cells, std::size_t columns) {
         const bool is_predicted = predicted != near.end() && !read_flag(64);
         cells[at] = is_predicted ? **predicted : bits.cell(bits.adaptive(value_mean));
     }
-    for (const Runs& runs : contexts) {
-        if (runs.left > 0) refuse("a run goes " + std::to_string(runs.left) + " flags beyond the last cell");
-    }
+    for (const Runs& runs : contexts) check(runs.left == 0, "a run goes ", runs.left, " flags beyond the last cell");
     bits.finish();
     return cells;
 }

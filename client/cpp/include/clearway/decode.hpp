@@ -36,6 +36,10 @@ struct RawLayer {
 };
 
 using wire::Fields;
+using wire::fixed;
+using wire::read;
+using wire::Unread;
+using wire::zigzag;
 
 // Counts layers, channels, planes, sensors and names, up to the first byte that is not protobuf; stops above the limit.
 inline void count_parts(Bytes message, bool is_map, std::size_t& parts) {
@@ -50,96 +54,19 @@ inline void count_parts(Bytes message, bool is_map, std::size_t& parts) {
     }
 }
 
-inline void read_header(Bytes message, Header& header) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: header.vehicle = fields.text(); break;
-            case 2: header.boot_id = fields.fixed64(); break;
-            case 3: header.sequence = fields.varint(); break;
-            case 4: header.capture_start_ns = fields.sfixed64(); break;
-            case 5: header.capture_end_ns = fields.sfixed64(); break;
-            case 6: header.completed_ns = fields.sfixed64(); break;
-            case 7: header.valid_until_ns = fields.sfixed64(); break;
-            case 8: {
-                if (!header.map_from_ego) header.map_from_ego.emplace();
-                Pose& pose = *header.map_from_ego;
-                double* const values[] = {&pose.x, &pose.y, &pose.z, &pose.qx, &pose.qy, &pose.qz, &pose.qw};
-                for (Fields of(fields.content()); of.next();) {
-                    if (of.tag() <= 7) *values[of.tag() - 1] = of.f64();
-                }
-                break;
-            }
-            case 9: header.speed_mps = fields.f64(); break;
-            case 14: header.epoch = fields.u32(); break;
-            case 16: header.wire_version = fields.u32(); break;
-            default: break;
-        }
-    }
+inline void read_header(Bytes message, Header& h) {
+    const auto pose = [&](Bytes content) {
+        if (!h.map_from_ego) h.map_from_ego.emplace();
+        Pose& p = *h.map_from_ego;
+        read(content, p.x, p.y, p.z, p.qx, p.qy, p.qz, p.qw);
+    };
+    const Unread other;
+    read(message, h.vehicle, fixed(h.boot_id), h.sequence, fixed(h.capture_start_ns), fixed(h.capture_end_ns),
+         fixed(h.completed_ns), fixed(h.valid_until_ns), pose, h.speed_mps, other, other, other, other, h.epoch, other,
+         h.wire_version);
 }
 
-inline void read_radial(Bytes message, RadialGrid& grid) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: fields.append(grid.row_radius_m, Fields::FIXED32, &Fields::f32); break;
-            case 2: grid.columns = fields.u32(); break;
-            case 3: grid.centre_x_m = fields.f32(); break;
-            case 4: grid.centre_y_m = fields.f32(); break;
-            default: break;
-        }
-    }
-}
-
-inline void read_cartesian(Bytes message, CartesianGrid& grid) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: grid.origin_x_m = fields.f64(); break;
-            case 2: grid.origin_y_m = fields.f64(); break;
-            case 3: grid.width = fields.u32(); break;
-            case 4: grid.height = fields.u32(); break;
-            case 5: grid.cell_m = fields.f32(); break;
-            case 6: grid.yaw_rad = fields.f64(); break;
-            case 7: grid.first_ix = fields.s64(); break;
-            case 8: grid.first_iy = fields.s64(); break;
-            default: break;
-        }
-    }
-}
-
-inline RawChannel read_channel(Bytes message) {
-    RawChannel raw;
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: raw.channel.name = fields.text(); break;
-            case 2: raw.channel.unit = fields.text(); break;
-            case 3: raw.channel.scale = fields.f32(); break;
-            case 4: raw.cell_type = fields.i32(); break;
-            case 5: raw.channel.unknown = fields.s32(); break;
-            case 6: raw.encoding = fields.i32(); break;
-            case 7: raw.cell_count = fields.u32(); break;
-            case 8: raw.crc32 = fields.fixed32(); break;
-            case 9: raw.payload = fields.content(); break;
-            case 10: raw.by_class = fields.content(); break;
-            default: break;
-        }
-    }
-    return raw;
-}
-
-inline void read_points(Bytes message, RawPoints& points) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: points.step_m = fields.f32(); break;
-            case 2: fields.append(points.x, Fields::VARINT, &Fields::s32); break;
-            case 3: fields.append(points.y, Fields::VARINT, &Fields::s32); break;
-            case 4: fields.append(points.radius_cm, Fields::VARINT, &Fields::s32); break;
-            case 5: fields.append(points.starts, Fields::VARINT, &Fields::u32); break;
-            case 6: fields.append(points.link_from, Fields::VARINT, &Fields::u32); break;
-            case 7: fields.append(points.link_back, Fields::VARINT, &Fields::u32); break;
-            default: break;
-        }
-    }
-}
-
+// The alternative of a `oneof`, as it is or made now.
 template <class Kind, class Variant>
 Kind& kept(Variant& geometry) {
     return std::holds_alternative<Kind>(geometry) ? std::get<Kind>(geometry) : geometry.template emplace<Kind>();
@@ -147,87 +74,74 @@ Kind& kept(Variant& geometry) {
 
 inline RawLayer read_layer(Bytes message) {
     RawLayer raw;
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: raw.layer.name = fields.text(); break;
-            case 2: read_radial(fields.content(), kept<RadialGrid>(raw.geometry)); break;
-            case 3: read_cartesian(fields.content(), kept<CartesianGrid>(raw.geometry)); break;
-            case 4: raw.names.push_back(fields.text()); break;
-            case 5: raw.channels.push_back(read_channel(fields.content())); break;
-            case 6: {
-                double values[3] = {0, 0, 0};
-                for (Fields of(fields.content()); of.next();) {
-                    if (of.tag() <= 3) values[of.tag() - 1] = of.f64();
-                }
-                raw.layer.planes.push_back({values[0], values[1], values[2]});
-                break;
-            }
-            case 7: {
-                std::pair<std::string, double> metric;
-                for (Fields of(fields.content()); of.next();) {
-                    if (of.tag() == 1) metric.first = of.text();
-                    if (of.tag() == 2) metric.second = of.f64();
-                }
-                raw.layer.metrics[metric.first] = metric.second;
-                break;
-            }
-            case 9:
-                if (!raw.points) raw.points.emplace();
-                read_points(fields.content(), *raw.points);
-                break;
-            case 10: raw.base_sequence = fields.varint(); break;
-            case 11: fields.append(raw.meanings, Fields::VARINT, &Fields::i32); break;
-            case 12: fields.append(raw.colours, Fields::FIXED32, &Fields::fixed32); break;
-            default: break;
-        }
-    }
+    const auto radial = [&](Bytes content) {
+        auto& grid = kept<RadialGrid>(raw.geometry);
+        read(content, grid.row_radius_m, grid.columns, grid.centre_x_m, grid.centre_y_m);
+    };
+    const auto cartesian = [&](Bytes content) {
+        auto& grid = kept<CartesianGrid>(raw.geometry);
+        read(content, grid.origin_x_m, grid.origin_y_m, grid.width, grid.height, grid.cell_m, grid.yaw_rad,
+             zigzag(grid.first_ix), zigzag(grid.first_iy));
+    };
+    const auto channel = [&](Bytes content) {
+        RawChannel& one = raw.channels.emplace_back();
+        Channel& as = one.channel;
+        read(content, as.name, as.unit, as.scale, one.cell_type, zigzag(as.unknown), one.encoding, one.cell_count,
+             fixed(one.crc32), one.payload, one.by_class);
+    };
+    const auto plane = [&](Bytes content) {
+        Plane& one = raw.layer.planes.emplace_back();
+        read(content, one.a, one.b, one.c);
+    };
+    const auto metric = [&](Bytes content) {
+        std::pair<std::string, double> one;
+        read(content, one.first, one.second);
+        raw.layer.metrics[one.first] = one.second;
+    };
+    const auto points = [&](Bytes content) {
+        if (!raw.points) raw.points.emplace();
+        RawPoints& of = *raw.points;
+        read(content, of.step_m, zigzag(of.x), zigzag(of.y), zigzag(of.radius_cm), of.starts, of.link_from,
+             of.link_back);
+    };
+    read(message, raw.layer.name, radial, cartesian, raw.names, channel, plane, metric, Unread{}, points,
+         raw.base_sequence, raw.meanings, fixed(raw.colours));
     return raw;
 }
 
 inline void check_header(const Header& header) {
-    if (header.wire_version > WIRE_VERSION) {
-        throw Error("version", "wire of version " + std::to_string(header.wire_version) +
-                                   "; this reader knows versions up to " + std::to_string(WIRE_VERSION));
-    }
-    if (header.capture_start_ns > header.capture_end_ns) {
-        throw Error("header", "capture starts at " + std::to_string(header.capture_start_ns) +
-                                  " ns; that is after its end at " + std::to_string(header.capture_end_ns) + " ns");
-    }
+    require(header.wire_version <= WIRE_VERSION, "version", "wire of version ", header.wire_version,
+            "; this reader knows versions up to ", WIRE_VERSION);
+    require(header.capture_start_ns <= header.capture_end_ns, "header", "capture starts at ", header.capture_start_ns,
+            " ns; that is after its end at ", header.capture_end_ns, " ns");
     if (!header.map_from_ego) return;
     const Pose& p = *header.map_from_ego;
     const double norm = std::sqrt(p.qx * p.qx + p.qy * p.qy + p.qz * p.qz + p.qw * p.qw);
     const bool is_finite = std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z) && std::isfinite(norm);
-    if (!is_finite || std::abs(norm - 1.0) > 1e-3) {
-        throw Error("header", "map_from_ego has a quaternion of norm " + std::to_string(norm) +
-                                  "; finite metres and norm 1 are needed");
-    }
+    require(is_finite && std::abs(norm - 1.0) <= 1e-3, "header", "map_from_ego has a quaternion of norm ", norm,
+            "; finite metres and norm 1 are needed");
 }
 
 inline Grid checked_grid(const RawLayer& raw) {
-    const auto wrong = [&](const std::string& what) {
-        return Error("geometry", "layer '" + raw.layer.name + "': " + what);
+    const auto check = [&](bool is_met, const auto&... what) {
+        require(is_met, "geometry", "layer '", raw.layer.name, "': ", what...);
     };
     if (const auto* grid = std::get_if<RadialGrid>(&raw.geometry)) {
         float inner = 0;
         for (const float outer : grid->row_radius_m) {
-            if (!std::isfinite(outer) || outer <= inner) {
-                throw wrong("a radius of " + std::to_string(outer) + " m; finite, ascending radii are needed");
-            }
+            check(std::isfinite(outer) && outer > inner, "a radius of ", outer, " m; finite, ascending ones are needed");
             inner = outer;
         }
-        if (grid->columns == 0 || grid->row_radius_m.empty()) throw wrong("0 cells; at least 1 is needed");
-        if (!std::isfinite(grid->centre_x_m) || !std::isfinite(grid->centre_y_m)) throw wrong("a centre not finite");
+        check(grid->columns > 0 && !grid->row_radius_m.empty(), "0 cells; at least 1 is needed");
+        check(std::isfinite(grid->centre_x_m) && std::isfinite(grid->centre_y_m), "a centre that is not finite");
         return *grid;
     }
     const auto* grid = std::get_if<CartesianGrid>(&raw.geometry);
-    if (!grid) throw wrong("no grid; radial or cartesian is needed");
-    if (grid->width == 0 || grid->height == 0) throw wrong("0 cells; at least 1 is needed");
-    if (!std::isfinite(grid->cell_m) || grid->cell_m <= 0) {
-        throw wrong("cells of " + std::to_string(grid->cell_m) + " m; a finite edge above 0 is needed");
-    }
-    if (!std::isfinite(grid->origin_x_m) || !std::isfinite(grid->origin_y_m) || !std::isfinite(grid->yaw_rad)) {
-        throw wrong("an origin or a yaw that is not finite");
-    }
+    check(grid, "no grid; radial or cartesian is needed");
+    check(grid->width > 0 && grid->height > 0, "0 cells; at least 1 is needed");
+    check(std::isfinite(grid->cell_m) && grid->cell_m > 0, "cells of ", grid->cell_m, " m; finite edges are needed");
+    check(std::isfinite(grid->origin_x_m) && std::isfinite(grid->origin_y_m) && std::isfinite(grid->yaw_rad),
+          "an origin or a yaw that is not finite");
     return *grid;
 }
 
@@ -237,17 +151,14 @@ struct Shift {
 };
 
 inline Shift shift_of(const Layer& base, const Layer& layer) {
-    const auto wrong = [&] {
-        return Error("base_shape", "layer '" + layer.name + "' is a delta to a grid that is not comparable");
-    };
-    if (const RadialGrid *before = base.grid.radial(), *now = layer.grid.radial(); before && now) {
-        const bool is_same = before->row_radius_m == now->row_radius_m && before->columns == now->columns &&
-                             before->centre_x_m == now->centre_x_m && before->centre_y_m == now->centre_y_m;
-        if (!is_same) throw wrong();
-        return {};
-    }
-    const CartesianGrid *before = base.grid.cartesian(), *now = layer.grid.cartesian();
-    if (!before || !now || before->cell_m != now->cell_m) throw wrong();
+    const RadialGrid *before = base.grid.radial(), *now = layer.grid.radial();
+    const CartesianGrid *squares = base.grid.cartesian(), *moved = layer.grid.cartesian();
+    const bool is_same = before && now ? before->row_radius_m == now->row_radius_m && before->columns == now->columns &&
+                                             before->centre_x_m == now->centre_x_m &&
+                                             before->centre_y_m == now->centre_y_m
+                                       : squares && moved && squares->cell_m == moved->cell_m;
+    require(is_same, "base_shape", "layer '", layer.name, "' is a delta to a grid that is not comparable");
+    if (now) return {};
     const auto steps = [](std::int64_t to, std::int64_t from) -> std::optional<std::int64_t> {
         // The difference of any two numbers fits in 64 bits without its sign.
         const auto far = to >= from ? static_cast<std::uint64_t>(to) - static_cast<std::uint64_t>(from)
@@ -255,18 +166,15 @@ inline Shift shift_of(const Layer& base, const Layer& layer) {
         if (far > UINT32_MAX) return std::nullopt;
         return to >= from ? static_cast<std::int64_t>(far) : -static_cast<std::int64_t>(far);
     };
-    return {steps(now->first_iy, before->first_iy), steps(now->first_ix, before->first_ix)};
+    return {steps(moved->first_iy, squares->first_iy), steps(moved->first_ix, squares->first_ix)};
 }
 
 // The base of a delta's channel: the base layer's cells at the places of the grid, `unknown` where it has none.
 inline Cells shifted(const RawChannel& raw, const Layer& base, const Layer& layer, const Shift& by) {
     const Channel* before = base.channel(raw.channel.name);
-    if (!before || static_cast<std::int32_t>(before->type) != raw.cell_type) {
-        throw Error("base_shape", "layer '" + layer.name + "': the base has no channel '" + raw.channel.name +
-                                      "' of cell type " + std::to_string(raw.cell_type));
-    }
-    const auto unknown = codec::wrapped(before->type, static_cast<std::uint32_t>(raw.channel.unknown));
-    Cells cells(raw.cell_count, unknown);
+    require(before && static_cast<std::int32_t>(before->type) == raw.cell_type, "base_shape", "layer '", layer.name,
+            "': the base has no channel '", raw.channel.name, "' of cell type ", raw.cell_type);
+    Cells cells(raw.cell_count, codec::wrapped(before->type, static_cast<std::uint32_t>(raw.channel.unknown)));
     if (!by.rows || !by.columns) return cells;
     const auto signed_size = [](std::size_t size) { return static_cast<std::int64_t>(size); };
     const auto rows = signed_size(layer.grid.rows()), columns = signed_size(layer.grid.columns());
@@ -286,49 +194,41 @@ inline Cells looked_up(const RawChannel& raw, const Layer& layer) {
     const auto type = raw.cell_type == 2 || raw.cell_type == 3 ? static_cast<CellType>(raw.cell_type) : CellType::U8;
     const Channel* classes = layer.channel("class");
     const std::size_t known = layer.legend.size();
-    const bool fits = classes && classes->type == CellType::U8 && raw.encoding == codec::CHANGES &&
-                      raw.by_class.size() == known * codec::bytes_of(type);
     const auto has_name = [&](std::int32_t cell) { return static_cast<std::size_t>(cell) < known; };
-    if (!fits || !std::all_of(classes->cells.begin(), classes->cells.end(), has_name)) {
-        throw Error("by_class", "channel '" + raw.channel.name + "' has a class table of " +
-                                    std::to_string(raw.by_class.size()) + " bytes; changes, one raw cell for each of " +
-                                    std::to_string(known) + " classes, and their channel before it are needed");
-    }
+    const bool fits = classes && classes->type == CellType::U8 && raw.encoding == codec::CHANGES &&
+                      raw.by_class.size() == known * codec::bytes_of(type) &&
+                      std::all_of(classes->cells.begin(), classes->cells.end(), has_name);
+    require(fits, "by_class", "channel '", raw.channel.name, "' has a class table of ", raw.by_class.size(),
+            " bytes; changes, one raw cell for each of ", known, " classes, and their channel before it are needed");
     const Cells table = codec::raw(raw.by_class, type);
-    Cells cells(classes->cells.size());
-    const auto look_up = [&](std::int32_t cell) { return table[static_cast<std::size_t>(cell)]; };
-    std::transform(classes->cells.begin(), classes->cells.end(), cells.begin(), look_up);
+    Cells cells;
+    for (const std::int32_t cell : classes->cells) cells.push_back(table[static_cast<std::size_t>(cell)]);
     return cells;
 }
 
 // Decodes the cells of a channel. `base`: as many cells of the same type, for changes.
 inline Cells decode_cells(const RawChannel& raw, std::size_t columns, std::optional<Cells> base) {
-    if (raw.cell_type < 1 || raw.cell_type > 3) codec::refuse("cell type " + std::to_string(raw.cell_type));
+    codec::check(raw.cell_type >= 1 && raw.cell_type <= 3, "cell type ", raw.cell_type, "; 1 to 3 are known");
     const auto type = static_cast<CellType>(raw.cell_type);
     const std::size_t length = raw.payload.size(), whole = raw.cell_count * codec::bytes_of(type);
     const bool fits = raw.encoding == codec::RAW       ? length == whole
                       : raw.encoding == codec::ROWS    ? length < whole
                       : raw.encoding == codec::CHANGES ? length < whole && base
                                                        : false;
-    if (!fits) {
-        codec::refuse(std::to_string(length) + " bytes of encoding " + std::to_string(raw.encoding) + " for " +
-                      std::to_string(raw.cell_count) + " cells" + (base ? "" : " without a base"));
-    }
+    codec::check(fits, length, " bytes of encoding ", raw.encoding, " for ", raw.cell_count, " cells",
+                 base ? "" : " without a base");
     const codec::Bits bits(raw.payload, type);
     const Cells cells = raw.encoding == codec::RAW    ? codec::raw(raw.payload, type)
                         : raw.encoding == codec::ROWS ? codec::rows(bits, raw.cell_count, columns)
                                                       : codec::changes(bits, std::move(*base), columns);
-    if (const auto computed = codec::crc32(cells, type); computed != raw.crc32) {
-        codec::refuse("CRC-32 of the cells is " + std::to_string(computed) + "; the channel states " +
-                      std::to_string(raw.crc32));
-    }
+    const std::uint32_t computed = codec::crc32(cells, type);
+    codec::check(computed == raw.crc32, "CRC-32 of the cells is ", computed, "; the channel states ", raw.crc32);
     return cells;
 }
 
 inline void check_count(const RawChannel& raw) {
-    if (raw.cell_count <= CHANNEL_CELLS_MAX) return;
-    throw Error("too_many_cells", std::to_string(raw.cell_count) + " cells; at most " +
-                                      std::to_string(CHANNEL_CELLS_MAX) + " are allowed");
+    require(raw.cell_count <= CHANNEL_CELLS_MAX, "too_many_cells", raw.cell_count, " cells; at most ",
+            CHANNEL_CELLS_MAX, " are allowed");
 }
 
 }  // namespace decoding

@@ -7,20 +7,16 @@ namespace clearway {
 namespace decoding {
 
 inline std::vector<Class> legend_of(const RawLayer& raw) {
-    const auto wrong = [&](const std::string& what) {
-        return Error("legend", "layer '" + raw.layer.name + "': " + what);
+    const auto check = [&](bool is_met, const auto&... what) {
+        require(is_met, "legend", "layer '", raw.layer.name, "': ", what...);
     };
     const std::size_t count = raw.names.size();
-    if (raw.meanings.size() != count || raw.colours.size() != count) {
-        throw wrong(std::to_string(count) + " names, " + std::to_string(raw.meanings.size()) + " meanings, " +
-                    std::to_string(raw.colours.size()) + " colours; equal numbers are needed");
-    }
-    if (count > 0 && raw.meanings[0] != 0) {
-        throw wrong("class 0 has the meaning " + std::to_string(raw.meanings[0]) + "; 0 (unknown) is needed");
-    }
+    check(raw.meanings.size() == count && raw.colours.size() == count, count, " names, ", raw.meanings.size(),
+          " meanings, ", raw.colours.size(), " colours; equal numbers are needed");
+    check(count == 0 || raw.meanings[0] == 0, "class 0 does not have the meaning 0 (unknown)");
     std::vector<Class> legend;
     for (std::size_t at = 0; at < count; ++at) {
-        if (raw.colours[at] > RGB_MAX) throw wrong("a colour of " + std::to_string(raw.colours[at]));
+        check(raw.colours[at] <= RGB_MAX, "a colour of ", raw.colours[at], "; at most ", RGB_MAX, " is allowed");
         // A vehicle does not enter cells of a meaning that this version does not know.
         const bool is_known = raw.meanings[at] >= 0 && raw.meanings[at] <= static_cast<std::int32_t>(Meaning::LOW);
         legend.push_back({raw.names[at], is_known ? static_cast<Meaning>(raw.meanings[at]) : Meaning::UNKNOWN,
@@ -30,53 +26,42 @@ inline std::vector<Class> legend_of(const RawLayer& raw) {
 }
 
 inline std::vector<SafePoint> points_of(const std::string& layer, const RawPoints& raw) {
-    const auto wrong = [&](std::size_t point, const std::string& what) {
-        return Error("safe_point", "layer '" + layer + "', safe point " + std::to_string(point) + ": " + what);
+    const auto check = [&](bool is_met, std::uint64_t point, const auto&... what) {
+        require(is_met, "safe_point", "layer '", layer, "', safe point ", point, ": ", what...);
     };
     const std::size_t count = raw.x.size();
-    if (raw.y.size() != count || raw.radius_cm.size() != count || count > MAP_PARTS_MAX) {
-        throw wrong(0, std::to_string(count) + " values; as many of each, at most " + std::to_string(MAP_PARTS_MAX) +
-                           ", are allowed");
-    }
-    if (!std::isfinite(raw.step_m) || raw.step_m <= 0) {
-        throw wrong(0, "steps of " + std::to_string(raw.step_m) + " m; finite metres over 0 are needed");
-    }
+    check(raw.y.size() == count && raw.radius_cm.size() == count && count <= MAP_PARTS_MAX, 0, count,
+          " values; as many of each, at most ", MAP_PARTS_MAX, ", are allowed");
+    check(std::isfinite(raw.step_m) && raw.step_m > 0, 0, "steps of ", raw.step_m, " m; finite ones over 0 are needed");
     std::vector<SafePoint> points;
     std::int64_t sums[3] = {0, 0, 0};
     for (std::size_t at = 0; at < count; ++at) {
         const std::int64_t differences[3] = {raw.x[at], raw.y[at], raw.radius_cm[at]};
         for (int axis = 0; axis < 3; ++axis) {
             sums[axis] += differences[axis];
-            if (std::abs(sums[axis]) > SAFE_POINT_STEPS_MAX || (axis == 2 && sums[axis] < 0)) {
-                throw wrong(at, std::to_string(sums[axis]) + " steps or cm; to " +
-                                    std::to_string(SAFE_POINT_STEPS_MAX) + " and a radius of 0 or more are allowed");
-            }
+            check(std::abs(sums[axis]) <= SAFE_POINT_STEPS_MAX && (axis < 2 || sums[axis] >= 0), at, sums[axis],
+                  " steps or cm; to ", SAFE_POINT_STEPS_MAX, " and a radius of 0 or more are allowed");
         }
-        SafePoint point{static_cast<float>(sums[0]) * raw.step_m, static_cast<float>(sums[1]) * raw.step_m,
-                        static_cast<float>(sums[2]) / 100.0f, {}};
-        if (at > 0) point.links.push_back(static_cast<std::uint32_t>(at - 1));
-        points.push_back(std::move(point));
+        points.push_back({static_cast<float>(sums[0]) * raw.step_m, static_cast<float>(sums[1]) * raw.step_m,
+                          static_cast<float>(sums[2]) / 100.0f, {}});
+        if (at > 0) points.back().links.push_back(static_cast<std::uint32_t>(at - 1));
     }
     std::uint64_t start = 0;
     for (const std::uint32_t ahead : raw.starts) {
         start += ahead;
-        if (ahead == 0 || start >= count) throw wrong(start, "starts a line; ascending points are needed");
+        check(ahead > 0 && start < count, start, "starts a line; ascending points are needed");
         points[start].links.clear();
     }
-    if (raw.link_from.size() != raw.link_back.size()) {
-        throw wrong(0, "links from " + std::to_string(raw.link_from.size()) + " points to " +
-                           std::to_string(raw.link_back.size()));
-    }
+    check(raw.link_from.size() == raw.link_back.size(), 0, "links from ", raw.link_from.size(), " points to ",
+          raw.link_back.size());
     std::uint64_t from = 0;
     std::optional<std::pair<std::uint64_t, std::uint64_t>> before;
     for (std::size_t at = 0; at < raw.link_from.size(); ++at) {
         from += raw.link_from[at];
         const std::uint32_t back = raw.link_back[at];
-        if (from >= count || back < 2 || back > from) {
-            throw wrong(from, "a link " + std::to_string(back) + " points back; 2 or more, to a point, are needed");
-        }
+        check(from < count && back >= 2 && back <= from, from, "a link ", back, " points back; 2 to it are allowed");
         const std::pair<std::uint64_t, std::uint64_t> link{from, from - back};
-        if (before && *before >= link) throw wrong(from, "a link to " + std::to_string(link.second) + " not ascending");
+        check(!before || *before < link, from, "a link to ", link.second, " is not ascending");
         before = link;
         // The link to the point before stays last.
         std::vector<std::uint32_t>& links = points[from].links;
@@ -90,24 +75,19 @@ inline std::vector<SafePoint> points_of(const std::string& layer, const RawPoint
 inline void check_classes(const Layer& layer) {
     const Channel* classes = layer.channel("class");
     if (!classes) return;
-    if (layer.legend.empty() || layer.legend[0].name != "unknown") {
-        throw Error("legend", "layer '" + layer.name + "': class 0 is 'unknown' in every legend");
-    }
+    require(!layer.legend.empty() && layer.legend[0].name == "unknown", "legend", "layer '", layer.name,
+            "': class 0 is 'unknown' in every legend");
     for (const std::int32_t cell : classes->cells) {
-        if (cell < 0 || static_cast<std::size_t>(cell) >= layer.legend.size()) {
-            throw Error("class", "layer '" + layer.name + "': class " + std::to_string(cell) + " has no name among " +
-                                     std::to_string(layer.legend.size()));
-        }
+        require(cell >= 0 && static_cast<std::size_t>(cell) < layer.legend.size(), "class", "layer '", layer.name,
+                "': class ", cell, " has no name among ", layer.legend.size());
     }
 }
 
 template <class List, class Name>
-void check_unique(const std::string& what, const List& list, Name name_of) {
+void check_unique(const char* what, const List& list, Name name_of) {
     std::set<std::string_view> names;
     for (const auto& item : list) {
-        if (!names.insert(name_of(item)).second) {
-            throw Error("twice", what + " '" + name_of(item) + "' occurs twice; names are unique");
-        }
+        require(names.insert(name_of(item)).second, "twice", what, " '", name_of(item), "' occurs twice");
     }
 }
 
@@ -121,10 +101,8 @@ inline Layer decode_layer(RawLayer raw, const Layer* base) {
     const bool has_legend = !raw.names.empty() || !raw.meanings.empty() || !raw.colours.empty();
     layer.legend = base && !has_legend ? base->legend : legend_of(raw);
     for (RawChannel& one : raw.channels) {
-        if (one.cell_count != layer.grid.cell_count()) {
-            throw Error("cell_count", "channel '" + one.channel.name + "' has " + std::to_string(one.cell_count) +
-                                          " cells; the grid has " + std::to_string(layer.grid.cell_count()));
-        }
+        require(one.cell_count == layer.grid.cell_count(), "cell_count", "channel '", one.channel.name, "' has ",
+                one.cell_count, " cells; the grid has ", layer.grid.cell_count());
         check_count(one);
         std::optional<Cells> from;
         if (!one.by_class.empty()) {
@@ -144,57 +122,39 @@ inline Layer decode_layer(RawLayer raw, const Layer* base) {
 // The base layer of a delta; null for a whole layer.
 inline const Layer* base_of(const RawLayer& raw, const Header& header, const Map* base) {
     if (!raw.base_sequence) return nullptr;
-    const std::string needed = std::to_string(*raw.base_sequence);
-    const auto missing = [&] {
-        return Error("no_base", "layer '" + raw.layer.name + "' is a delta to the layer of map " + needed);
-    };
-    if (!base) throw missing();
-    const Header& given = base->header;
-    if (given.vehicle != header.vehicle || given.boot_id != header.boot_id || given.sequence != *raw.base_sequence) {
-        throw Error("other_base", "layer '" + raw.layer.name + "' is a delta to map " + needed + " of '" +
-                                      header.vehicle + "'; map " + std::to_string(given.sequence) + " of '" +
-                                      given.vehicle + "' was given");
-    }
-    if (const Layer* found = base->find(raw.layer.name)) return found;
-    throw missing();
+    const Layer* found = base ? base->find(raw.layer.name) : nullptr;
+    const bool is_it = base && base->header.vehicle == header.vehicle && base->header.boot_id == header.boot_id &&
+                       base->header.sequence == *raw.base_sequence;
+    require(!base || is_it, "other_base", "layer '", raw.layer.name, "' is a delta to map ", *raw.base_sequence, " of '",
+            header.vehicle, "'; another one was given");
+    require(found, "no_base", "layer '", raw.layer.name, "' is a delta to the layer of map ", *raw.base_sequence);
+    return found;
 }
 
 }  // namespace decoding
 
 inline Map Map::decode(Bytes bytes, const Map* base) {
     using namespace decoding;
-    if (bytes.size() > MAP_BYTES_MAX) {
-        throw Error("too_long", "map of " + std::to_string(bytes.size()) + " bytes; at most " +
-                                    std::to_string(MAP_BYTES_MAX) + " are allowed");
-    }
+    require(bytes.size() <= MAP_BYTES_MAX, "too_long", "map of ", bytes.size(), " bytes; at most ", MAP_BYTES_MAX,
+            " are allowed");
     std::size_t parts = 0;
     count_parts(bytes, true, parts);
-    if (parts > MAP_PARTS_MAX) {
-        throw Error("too_many_parts", "over " + std::to_string(MAP_PARTS_MAX) + " layers, channels, sensors and names");
-    }
-    std::optional<Header> header;
+    require(parts <= MAP_PARTS_MAX, "too_many_parts", "over ", MAP_PARTS_MAX, " layers, channels, sensors and names");
+    Map map;
+    bool has_header = false;
     std::vector<RawLayer> layers;
-    for (Fields fields(bytes); fields.next();) {
-        if (fields.tag() == 1) {
-            if (!header) header.emplace();
-            read_header(fields.content(), *header);
-        } else if (fields.tag() == 2) {
-            layers.push_back(read_layer(fields.content()));
-        }
-    }
-    if (!header) throw Error("header", "the header is absent; every map has one");
-    check_header(*header);
+    const auto header = [&](Bytes content) { has_header = true, read_header(content, map.header); };
+    const auto layer = [&](Bytes content) { layers.push_back(read_layer(content)); };
+    read(bytes, header, layer);
+    require(has_header, "header", "the header is absent; every map has one");
+    check_header(map.header);
     check_unique("layer", layers, [](const RawLayer& raw) -> const std::string& { return raw.layer.name; });
     std::uint64_t cells = 0;
     for (const RawLayer& raw : layers) {
         for (const RawChannel& channel : raw.channels) cells += channel.cell_count;
     }
-    if (cells > MAP_CELLS_MAX) {
-        throw Error("too_many_cells", "the channels claim " + std::to_string(cells) + " cells; at most " +
-                                          std::to_string(MAP_CELLS_MAX) + " are allowed");
-    }
-    Map map;
-    map.header = std::move(*header);
+    require(cells <= MAP_CELLS_MAX, "too_many_cells", "the channels claim ", cells, " cells; at most ", MAP_CELLS_MAX,
+            " are allowed");
     for (RawLayer& raw : layers) {
         const Layer* before = base_of(raw, map.header, base);
         map.layers.push_back(decode_layer(std::move(raw), before));

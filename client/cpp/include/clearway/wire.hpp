@@ -7,9 +7,12 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <optional>
+#include <sstream>
 #include <stdexcept>
 #include <string>
 #include <string_view>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -28,6 +31,19 @@ private:
     std::string reason_;
 };
 
+// Throws an `Error` whose message is these parts, one after another.
+template <class... Parts>
+[[noreturn]] void fail(const char* reason, const Parts&... parts) {
+    std::ostringstream message;
+    (message << ... << parts);
+    throw Error(reason, message.str());
+}
+
+template <class... Parts>
+void require(bool is_met, const char* reason, const Parts&... parts) {
+    if (!is_met) fail(reason, parts...);
+}
+
 inline constexpr std::uint32_t CHANNEL_CELLS_MAX = 4u << 20;
 inline constexpr std::uint64_t MAP_CELLS_MAX = 16u << 20;
 inline constexpr std::size_t MAP_BYTES_MAX = 4u << 20;
@@ -40,8 +56,9 @@ inline constexpr std::uint32_t WIRE_VERSION = 1;
 
 namespace wire {
 
-[[noreturn]] inline void refuse(const std::string& what) {
-    throw Error("protobuf", "not an encoded clearway.v1.Map: " + what);
+template <class... Parts>
+[[noreturn]] void refuse(const Parts&... parts) {
+    fail("protobuf", "not an encoded clearway.v1 message: ", parts...);
 }
 
 // True if the bytes are UTF-8: no overlong form, no surrogate, nothing above U+10FFFF.
@@ -61,6 +78,22 @@ inline bool is_utf8(Bytes text) {
     return true;
 }
 
+// How an integer travels: as a varint, as a varint that alternates between the signs, or in 4 or 8 bytes.
+enum class Form { PLAIN, ZIGZAG, FIXED };
+
+// A target of `read` whose type does not say how its numbers travel.
+template <Form form, class Target>
+struct As {
+    Target& target;
+};
+template <class Target>
+As<Form::ZIGZAG, Target> zigzag(Target& target) { return {target}; }
+template <class Target>
+As<Form::FIXED, Target> fixed(Target& target) { return {target}; }
+
+// A field that is passed over.
+struct Unread {};
+
 // The fields of one message, in their order.
 class Fields {
 public:
@@ -74,84 +107,90 @@ public:
         const std::uint64_t key = read_varint();
         tag_ = static_cast<std::uint32_t>(key >> 3);
         type_ = static_cast<std::uint32_t>(key & 7);
-        if (key > UINT32_MAX || tag_ == 0) refuse("a field with the key " + std::to_string(key));
-        if (type_ == VARINT) {
-            number_ = read_varint();
-        } else if (type_ == FIXED64) {
-            number_ = read_fixed(8);
-        } else if (type_ == FIXED32) {
-            number_ = read_fixed(4);
-        } else if (type_ == LENGTH) {
+        if (key > UINT32_MAX || tag_ == 0) refuse("a field with the key ", key);
+        if (type_ == LENGTH) {
             content_ = take(read_varint());
         } else {
-            refuse("field " + std::to_string(tag_) + " has the wire type " + std::to_string(type_) +
-                   "; 0, 1, 2 and 5 are read");
+            read_number();
         }
         return true;
     }
 
     std::uint32_t tag() const { return tag_; }
     bool has_content() const { return type_ == LENGTH; }
-
     Bytes content() const { return expect(LENGTH), content_; }
-    std::string text() const {
-        if (!is_utf8(content())) refuse("field " + std::to_string(tag_) + " is no UTF-8 text");
-        return std::string(content_);
-    }
-    std::uint64_t varint() const { return expect(VARINT), number_; }
-    std::uint32_t u32() const { return static_cast<std::uint32_t>(varint()); }
-    std::int32_t i32() const { return signed_of(u32()); }
-    std::int32_t s32() const { return zigzag(u32()); }
-    std::int64_t s64() const { return from_bits<std::int64_t>((varint() >> 1) ^ (0 - (varint() & 1))); }
-    std::uint64_t fixed64() const { return expect(FIXED64), number_; }
-    std::int64_t sfixed64() const { return from_bits<std::int64_t>(fixed64()); }
-    std::uint32_t fixed32() const { return expect(FIXED32), static_cast<std::uint32_t>(number_); }
-    double f64() const { return from_bits<double>(fixed64()); }
-    float f32() const { return from_bits<float>(fixed32()); }
 
-    // The numbers of a repeated field, packed or not, appended to a list. `read` is the method for one of them.
-    template <class Number, class Read>
-    void append(std::vector<Number>& list, Type type, Read read) const {
-        if (!has_content()) return list.push_back((this->*read)());
-        for (Fields packed(content_); packed.at_ < packed.bytes_.size();) {
-            packed.tag_ = tag_;
-            packed.type_ = type;
-            packed.number_ = type == VARINT ? packed.read_varint() : packed.read_fixed(type == FIXED32 ? 4 : 8);
-            list.push_back((packed.*read)());
-        }
-    }
-
-private:
-    static std::int32_t signed_of(std::uint32_t bits) { return from_bits<std::int32_t>(bits); }
-    static std::int32_t zigzag(std::uint32_t bits) { return signed_of((bits >> 1) ^ (0 - (bits & 1))); }
-
-    template <class To, class From>
-    static To from_bits(From bits) {
-        static_assert(sizeof(To) == sizeof(From));
-        To value;
+    template <Form form, class Number>
+    Number number() const {
+        constexpr bool is_varint = form != Form::FIXED && !std::is_floating_point_v<Number>;
+        expect(is_varint ? VARINT : sizeof(Number) == 8 ? FIXED64 : FIXED32);
+        using Bits = std::conditional_t<sizeof(Number) == 8, std::uint64_t, std::uint32_t>;
+        auto bits = static_cast<Bits>(number_);
+        if (form == Form::ZIGZAG) bits = bits >> 1 ^ (0 - (bits & 1));
+        Number value;
+        static_assert(sizeof value == sizeof bits);
         std::memcpy(&value, &bits, sizeof value);
         return value;
     }
 
+    // Puts the field into a number, a text, bytes, a list, or a function that reads the content.
+    template <Form form = Form::PLAIN, class Target>
+    void into(Target&& target) const {
+        if constexpr (std::is_invocable_v<Target, Bytes>) {
+            target(content());
+        } else {
+            target = number<form, std::decay_t<Target>>();
+        }
+    }
+    void into(std::string& text) const {
+        if (!is_utf8(content())) refuse("field ", tag_, " is no UTF-8 text");
+        text = content_;
+    }
+    void into(Bytes& bytes) const { bytes = content(); }
+    void into(Unread) const {}
+    template <class Number>
+    void into(std::optional<Number>& number) const { into(number.emplace()); }
+    void into(std::vector<std::string>& texts) const { into(texts.emplace_back()); }
+    // The numbers of a repeated field, packed or not.
+    template <Form form = Form::PLAIN, class Number>
+    void into(std::vector<Number>& list) const {
+        if (!has_content()) return list.push_back(number<form, Number>());
+        constexpr bool is_varint = form != Form::FIXED && !std::is_floating_point_v<Number>;
+        for (Fields packed(content_); packed.at_ < packed.bytes_.size();) {
+            packed.tag_ = tag_;
+            packed.type_ = is_varint ? VARINT : FIXED32;
+            packed.read_number();
+            list.push_back(packed.number<form, Number>());
+        }
+    }
+    template <Form form, class Target>
+    void into(As<form, Target> as) const { into<form>(as.target); }
+
+private:
     void expect(Type type) const {
-        if (type_ == type) return;
-        refuse("field " + std::to_string(tag_) + " has the wire type " + std::to_string(type_) + "; " +
-               std::to_string(type) + " is needed");
+        if (type_ != type) refuse("field ", tag_, " has the wire type ", type_, "; ", type, " is needed");
     }
 
     Bytes take(std::uint64_t length) {
         const std::size_t left = bytes_.size() - at_;
-        if (length > left) refuse(std::to_string(length) + " bytes claimed, " + std::to_string(left) + " left");
+        if (length > left) refuse(length, " bytes claimed, ", left, " left");
         const Bytes taken = bytes_.substr(at_, static_cast<std::size_t>(length));
         at_ += taken.size();
         return taken;
     }
 
-    std::uint64_t read_fixed(unsigned bytes) {
-        const Bytes taken = take(bytes);
-        std::uint64_t number = 0;
-        for (unsigned index = bytes; index-- > 0;) number = number << 8 | static_cast<unsigned char>(taken[index]);
-        return number;
+    void read_number() {
+        if (type_ == VARINT) {
+            number_ = read_varint();
+        } else if (type_ == FIXED64 || type_ == FIXED32) {
+            number_ = 0;
+            const Bytes taken = take(type_ == FIXED64 ? 8 : 4);
+            for (std::size_t index = taken.size(); index-- > 0;) {
+                number_ = number_ << 8 | static_cast<unsigned char>(taken[index]);
+            }
+        } else {
+            refuse("field ", tag_, " has the wire type ", type_, "; 0, 1, 2 and 5 are read");
+        }
     }
 
     std::uint64_t read_varint() {
@@ -171,6 +210,15 @@ private:
     std::uint64_t number_ = 0;
     Bytes content_;
 };
+
+// Reads a message: its field 1 into the first target, its field 2 into the second, and so on.
+template <class... Targets>
+void read(Bytes message, Targets&&... targets) {
+    for (Fields fields(message); fields.next();) {
+        std::uint32_t tag = 0;
+        ((++tag == fields.tag() ? fields.into(targets) : void()), ...);
+    }
+}
 
 }  // namespace wire
 }  // namespace clearway
