@@ -172,7 +172,6 @@ std::string answered(Words& words, Map& map) {
         raw.crc32 = static_cast<std::uint32_t>(std::stoul(words.word()));
         const std::string payload = from_hex(words.word());
         raw.payload = payload;
-        decoding::check_count(raw);
         const Cells cells = decoding::decode_cells(raw, columns, std::nullopt);
         return list(cells, [](std::int32_t cell) { return std::to_string(cell); });
     }

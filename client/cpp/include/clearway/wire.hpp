@@ -3,46 +3,19 @@
 // In: bytes from any source. Out: fields in their order, or an `Error` with the value that was refused.
 #pragma once
 
-#include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <limits>
 #include <optional>
-#include <sstream>
-#include <stdexcept>
-#include <string>
 #include <string_view>
 #include <type_traits>
-#include <utility>
 #include <vector>
+
+#include "error.hpp"
 
 namespace clearway {
 
 // Bytes of a message or a payload. They are not copied.
 using Bytes = std::string_view;
-
-// What is wrong with a map, a shape or a question. `reason` is the short name that all client languages share.
-class Error : public std::runtime_error {
-public:
-    Error(std::string reason, const std::string& message) : std::runtime_error(message), reason_(std::move(reason)) {}
-    const std::string& reason() const { return reason_; }
-
-private:
-    std::string reason_;
-};
-
-// Throws an `Error` whose message is these parts, one after another.
-template <class... Parts>
-[[noreturn]] void fail(const char* reason, const Parts&... parts) {
-    std::ostringstream message;
-    (message << ... << parts);
-    throw Error(reason, message.str());
-}
-
-template <class... Parts>
-void require(bool is_met, const char* reason, const Parts&... parts) {
-    if (!is_met) fail(reason, parts...);
-}
 
 inline constexpr std::uint32_t CHANNEL_CELLS_MAX = 4u << 20;
 inline constexpr std::uint64_t MAP_CELLS_MAX = 16u << 20;
@@ -86,10 +59,8 @@ template <Form form, class Target>
 struct As {
     Target& target;
 };
-template <class Target>
-As<Form::ZIGZAG, Target> zigzag(Target& target) { return {target}; }
-template <class Target>
-As<Form::FIXED, Target> fixed(Target& target) { return {target}; }
+template <class Target> As<Form::ZIGZAG, Target> zigzag(Target& target) { return {target}; }
+template <class Target> As<Form::FIXED, Target> fixed(Target& target) { return {target}; }
 
 // A field that is passed over.
 struct Unread {};
@@ -103,16 +74,21 @@ public:
 
     // Goes to the next field; false at the end of the message.
     bool next() {
-        if (at_ == bytes_.size()) return false;
-        const std::uint64_t key = read_varint();
+        if (is_at_end()) return false;
+        const std::uint64_t key = varint();
         tag_ = static_cast<std::uint32_t>(key >> 3);
         type_ = static_cast<std::uint32_t>(key & 7);
         if (key > UINT32_MAX || tag_ == 0) refuse("a field with the key ", key);
-        if (type_ == LENGTH) {
-            content_ = take(read_varint());
+        if (type_ == LENGTH) return content_ = take(varint()), true;
+        const std::size_t start = at_;
+        if (type_ == VARINT) {
+            varint();
+        } else if (type_ == FIXED64 || type_ == FIXED32) {
+            take(type_ == FIXED64 ? 8 : 4);
         } else {
-            read_number();
+            refuse("field ", tag_, " has the wire type ", type_, "; 0, 1, 2 and 5 are read");
         }
+        content_ = bytes_.substr(start, at_ - start);
         return true;
     }
 
@@ -120,26 +96,15 @@ public:
     bool has_content() const { return type_ == LENGTH; }
     Bytes content() const { return expect(LENGTH), content_; }
 
-    template <Form form, class Number>
-    Number number() const {
-        constexpr bool is_varint = form != Form::FIXED && !std::is_floating_point_v<Number>;
-        expect(is_varint ? VARINT : sizeof(Number) == 8 ? FIXED64 : FIXED32);
-        using Bits = std::conditional_t<sizeof(Number) == 8, std::uint64_t, std::uint32_t>;
-        auto bits = static_cast<Bits>(number_);
-        if (form == Form::ZIGZAG) bits = bits >> 1 ^ (0 - (bits & 1));
-        Number value;
-        static_assert(sizeof value == sizeof bits);
-        std::memcpy(&value, &bits, sizeof value);
-        return value;
-    }
-
     // Puts the field into a number, a text, bytes, a list, or a function that reads the content.
     template <Form form = Form::PLAIN, class Target>
     void into(Target&& target) const {
         if constexpr (std::is_invocable_v<Target, Bytes>) {
             target(content());
         } else {
-            target = number<form, std::decay_t<Target>>();
+            using Number = std::decay_t<Target>;
+            expect(type_of<form, Number>());
+            target = Fields(content_).number<form, Number>();
         }
     }
     void into(std::string& text) const {
@@ -148,25 +113,25 @@ public:
     }
     void into(Bytes& bytes) const { bytes = content(); }
     void into(Unread) const {}
-    template <class Number>
-    void into(std::optional<Number>& number) const { into(number.emplace()); }
+    template <class Number> void into(std::optional<Number>& number) const { into(number.emplace()); }
     void into(std::vector<std::string>& texts) const { into(texts.emplace_back()); }
     // The numbers of a repeated field, packed or not.
     template <Form form = Form::PLAIN, class Number>
     void into(std::vector<Number>& list) const {
-        if (!has_content()) return list.push_back(number<form, Number>());
-        constexpr bool is_varint = form != Form::FIXED && !std::is_floating_point_v<Number>;
-        for (Fields packed(content_); packed.at_ < packed.bytes_.size();) {
-            packed.tag_ = tag_;
-            packed.type_ = is_varint ? VARINT : FIXED32;
-            packed.read_number();
-            list.push_back(packed.number<form, Number>());
-        }
+        if (!has_content()) expect(type_of<form, Number>());
+        for (Fields numbers(content_); !numbers.is_at_end();) list.push_back(numbers.number<form, Number>());
     }
-    template <Form form, class Target>
-    void into(As<form, Target> as) const { into<form>(as.target); }
+    template <Form form, class Target> void into(As<form, Target> as) const { into<form>(as.target); }
 
 private:
+    template <Form form, class Number>
+    static constexpr Type type_of() {
+        if (form != Form::FIXED && !std::is_floating_point_v<Number>) return VARINT;
+        return sizeof(Number) == 8 ? FIXED64 : FIXED32;
+    }
+
+    bool is_at_end() const { return at_ == bytes_.size(); }
+
     void expect(Type type) const {
         if (type_ != type) refuse("field ", tag_, " has the wire type ", type_, "; ", type, " is needed");
     }
@@ -174,26 +139,10 @@ private:
     Bytes take(std::uint64_t length) {
         const std::size_t left = bytes_.size() - at_;
         if (length > left) refuse(length, " bytes claimed, ", left, " left");
-        const Bytes taken = bytes_.substr(at_, static_cast<std::size_t>(length));
-        at_ += taken.size();
-        return taken;
+        return bytes_.substr(std::exchange(at_, at_ + static_cast<std::size_t>(length)), length);
     }
 
-    void read_number() {
-        if (type_ == VARINT) {
-            number_ = read_varint();
-        } else if (type_ == FIXED64 || type_ == FIXED32) {
-            number_ = 0;
-            const Bytes taken = take(type_ == FIXED64 ? 8 : 4);
-            for (std::size_t index = taken.size(); index-- > 0;) {
-                number_ = number_ << 8 | static_cast<unsigned char>(taken[index]);
-            }
-        } else {
-            refuse("field ", tag_, " has the wire type ", type_, "; 0, 1, 2 and 5 are read");
-        }
-    }
-
-    std::uint64_t read_varint() {
+    std::uint64_t varint() {
         std::uint64_t number = 0;
         for (unsigned shift = 0; shift < 70; shift += 7) {
             const auto byte = static_cast<unsigned char>(take(1)[0]);
@@ -204,11 +153,24 @@ private:
         refuse("a number of more than 64 bits");
     }
 
-    Bytes bytes_;
+    template <Form form, class Number>
+    Number number() {
+        using Bits = std::conditional_t<sizeof(Number) == 8, std::uint64_t, std::uint32_t>;
+        constexpr bool is_varint = type_of<form, Number>() == VARINT;
+        auto bits = is_varint ? static_cast<Bits>(varint()) : Bits{0};
+        for (unsigned shift = 0; !is_varint && shift < 8 * sizeof bits; shift += 8) {
+            bits |= static_cast<Bits>(static_cast<unsigned char>(take(1)[0])) << shift;
+        }
+        if (form == Form::ZIGZAG) bits = bits >> 1 ^ (0 - (bits & 1));
+        Number value;
+        static_assert(sizeof value == sizeof bits);
+        std::memcpy(&value, &bits, sizeof value);
+        return value;
+    }
+
+    Bytes bytes_, content_;
     std::size_t at_ = 0;
     std::uint32_t tag_ = 0, type_ = 0;
-    std::uint64_t number_ = 0;
-    Bytes content_;
 };
 
 // Reads a message: its field 1 into the first target, its field 2 into the second, and so on.
