@@ -17,13 +17,13 @@ int main(int count, char** arguments) {
         while (true) {
             const auto map = maps.next();
             const auto now = clearway::Clocks::now();
+            std::cout << "map " << map->header.sequence << ", " << map->age_ns(now) / 1'000'000 << " ms old: ";
             if (const auto because = map->staleness(now)) {
                 std::cout << "STALE: " << *because;
                 for (const std::string& reason : maps.reasons()) std::cout << "; " << reason;
                 std::cout << std::endl;
                 continue;
             }
-            std::cout << "map " << map->header.sequence << ", " << map->age_ns(now) / 1'000'000 << " ms old: ";
             const auto met = clearway::along(map->layer("freespace"), clearway::Arc{0.0, 20.0}, car);
             if (const auto& by = met.blocked) {
                 std::cout << "blocked after " << by->along_m << " m by " << by->blocker.name;

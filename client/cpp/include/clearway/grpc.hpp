@@ -81,31 +81,6 @@ inline Message selection(const Subscription& wanted) {
     return request;
 }
 
-// One `MapUpdate`.
-struct Update {
-    std::string map;
-    std::uint64_t left_out = 0;
-    bool replay_ended = false;
-    std::optional<std::vector<std::string>> reasons;
-
-    explicit Update(const Buffer& buffer) {
-        std::vector<::grpc::Slice> slices;
-        if (!buffer.Dump(&slices).ok()) wire::refuse("a message that is not whole");
-        std::string bytes;
-        for (const auto& slice : slices) bytes.append(reinterpret_cast<const char*>(slice.begin()), slice.size());
-        for (wire::Fields fields(bytes); fields.next();) {
-            if (fields.tag() == 1) map = fields.content();
-            if (fields.tag() == 4) left_out = fields.varint();
-            if (fields.tag() == 5) replay_ended = fields.varint() != 0;
-            if (fields.tag() != 7) continue;
-            reasons.emplace();
-            for (wire::Fields vehicle(fields.content()); vehicle.next();) {
-                if (vehicle.tag() == 16) reasons->push_back(vehicle.text());
-            }
-        }
-    }
-};
-
 // A connection of its own, with a small window, as Python's client has it: a server that disappears is noticed after
 // two intervals of 2 s, and no proxy of the environment is asked.
 inline std::shared_ptr<::grpc::Channel> channel(const std::string& server,
@@ -113,6 +88,7 @@ inline std::shared_ptr<::grpc::Channel> channel(const std::string& server,
     ::grpc::ChannelArguments arguments;
     arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 2000);
     arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 2000);
+    arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 5000);
     arguments.SetInt(GRPC_ARG_HTTP2_STREAM_LOOKAHEAD_BYTES, 65'535);
     arguments.SetInt(GRPC_ARG_HTTP2_BDP_PROBE, 0);
     arguments.SetInt(GRPC_ARG_USE_LOCAL_SUBCHANNEL_POOL, 1);
@@ -121,21 +97,31 @@ inline std::shared_ptr<::grpc::Channel> channel(const std::string& server,
     return ::grpc::CreateCustomChannel(server, credentials, arguments);
 }
 
-// Name of a status code, as every client has it in the `reason` of an error.
-inline std::string name_of(::grpc::StatusCode code) {
+// All bytes of a message.
+inline std::string flat(const Buffer& buffer) {
+    std::vector<::grpc::Slice> slices;
+    if (!buffer.Dump(&slices).ok()) wire::refuse("a message that is not whole");
+    std::string bytes;
+    for (const auto& slice : slices) bytes.append(reinterpret_cast<const char*>(slice.begin()), slice.size());
+    return bytes;
+}
+
+// Why a call has ended; the reason is the name of the status code.
+inline Error ended(const std::string& server, const ::grpc::Status& status) {
     constexpr const char* NAMES[] = {"OK", "CANCELLED", "UNKNOWN", "INVALID_ARGUMENT", "DEADLINE_EXCEEDED", "NOT_FOUND",
                                      "ALREADY_EXISTS", "PERMISSION_DENIED", "RESOURCE_EXHAUSTED", "FAILED_PRECONDITION",
                                      "ABORTED", "OUT_OF_RANGE", "UNIMPLEMENTED", "INTERNAL", "UNAVAILABLE", "DATA_LOSS",
                                      "UNAUTHENTICATED"};
-    return code >= 0 && code <= ::grpc::UNAUTHENTICATED ? NAMES[code] : NAMES[::grpc::UNKNOWN];
+    const auto code = static_cast<std::size_t>(status.error_code());
+    if (status.ok()) return Error("ended", server + ": the server has ended the stream");
+    return Error(NAMES[code < std::size(NAMES) ? code : 2], server + ": " + status.error_message());
 }
 
 // True if another attempt would end in the same way: the request or the client itself is refused.
 inline bool is_lasting(const Error& ended) {
-    constexpr ::grpc::StatusCode CODES[] = {::grpc::INVALID_ARGUMENT, ::grpc::PERMISSION_DENIED,
-                                            ::grpc::UNAUTHENTICATED, ::grpc::FAILED_PRECONDITION,
-                                            ::grpc::UNIMPLEMENTED};
-    return std::any_of(std::begin(CODES), std::end(CODES), [&](auto code) { return ended.reason() == name_of(code); });
+    constexpr std::string_view REASONS[] = {"INVALID_ARGUMENT", "PERMISSION_DENIED", "UNAUTHENTICATED",
+                                            "FAILED_PRECONDITION", "UNIMPLEMENTED"};
+    return std::find(std::begin(REASONS), std::end(REASONS), ended.reason()) != std::end(REASONS);
 }
 
 }  // namespace grpc_stream
@@ -171,7 +157,7 @@ public:
         if (given_ == newest_) acknowledge();
         while (true) {
             if (given_ != newest_) return give();
-            if (std::exchange(is_replay_end_, false)) throw Error("replay_ended", "the replay has ended");
+            if (std::exchange(is_replay_end_, false)) fail("replay_ended", "the replay has ended");
             if (ended_) throw *ended_;
             if (!is_fresh_) {
                 changed_.wait(lock);
@@ -198,10 +184,10 @@ public:
 private:
     // Returns the newest map. The lock is held.
     std::shared_ptr<const Map> give() {
-        const Header* before = given_ ? &given_->header : nullptr;
         const Header& now = newest_->header;
+        const bool is_next = given_ && given_->header.boot_id == now.boot_id;
+        const std::uint64_t between = is_next ? now.sequence - given_->header.sequence - 1 : 0;
         left_out_ = std::exchange(left_out_since_, 0);
-        const std::uint64_t between = before && before->boot_id == now.boot_id ? now.sequence - before->sequence - 1 : 0;
         skipped_ = between - std::min(between, left_out_);
         given_ = newest_;
         is_fresh_ = !given_->is_stale(Clocks::now());
@@ -216,32 +202,43 @@ private:
         call_->Write(request.buffer());
     }
 
-    void receive(const grpc_stream::Update& update) {
+    // Takes one `MapUpdate`: a map, the end of a replay, or the state of a vehicle without a map.
+    void receive(Bytes update) {
+        Bytes encoded;
+        std::uint64_t left_out = 0, is_end = 0;
+        std::optional<std::vector<std::string>> reasons;
+        const auto vehicle = [&](Bytes state) {
+            reasons.emplace();
+            for (wire::Fields fields(state); fields.next();) {
+                if (fields.tag() == 16) fields.into(*reasons);
+            }
+        };
+        const wire::Unread other;
+        wire::read(update, encoded, other, other, left_out, is_end, other, vehicle);
         std::shared_ptr<Map> map;
-        if (!update.replay_ended && !update.reasons) {
-            map = std::make_shared<Map>(Map::decode(update.map, newest_.get()));
+        if (is_end == 0 && !reasons) {
+            map = std::make_shared<Map>(Map::decode(encoded, newest_.get()));
             map->arrived(Clocks::now());
         }
         const std::lock_guard<std::mutex> lock(mutex_);
-        is_replay_end_ = is_replay_end_ || update.replay_ended;
-        if (update.reasons) reasons_ = *update.reasons;
-        if (map) {
-            unacknowledged_ = map->header.sequence;
-            left_out_since_ += update.left_out;
-            reasons_.clear();
-            // A stream that is opened again begins with the newest map, also if it was received before.
-            const bool is_known = newest_ && newest_->header.boot_id == map->header.boot_id &&
-                                  newest_->header.sequence >= map->header.sequence;
-            if (is_known) acknowledge();
-            if (!is_known) newest_ = map;
+        is_replay_end_ = is_replay_end_ || is_end != 0;
+        left_out_since_ += left_out;
+        if (!map) {
+            if (reasons) reasons_ = std::move(*reasons);
+            return changed_.notify_all();
         }
+        reasons_.clear();
+        unacknowledged_ = map->header.sequence;
+        // A stream that is opened again begins with the newest map, also if it was received before.
+        const bool is_known = newest_ && newest_->header.boot_id == map->header.boot_id &&
+                              newest_->header.sequence >= map->header.sequence;
+        if (is_known) return acknowledge();
+        newest_ = std::move(map);
         changed_.notify_all();
     }
 
     // Receives one stream; returns why it has ended. Throws the fault of a map that is refused.
     Error receive_stream() {
-        const ::grpc::internal::RpcMethod method("/clearway.v1.MapService/Watch",
-                                                 ::grpc::internal::RpcMethod::BIDI_STREAMING);
         const auto channel = grpc_stream::channel(server_, credentials_);
         {
             const std::lock_guard<std::mutex> lock(mutex_);
@@ -252,36 +249,36 @@ private:
         }
         // As generated code opens a call.
         using Factory = ::grpc::internal::ClientReaderWriterFactory<grpc_stream::Buffer, grpc_stream::Buffer>;
+        using Method = ::grpc::internal::RpcMethod;
+        const Method method("/clearway.v1.MapService/Watch", Method::BIDI_STREAMING);
         call_.reset(Factory::Create(channel.get(), method, context_.get()));
         call_->Write(grpc_stream::selection(wanted_).buffer());
         try {
-            for (grpc_stream::Buffer buffer; call_->Read(&buffer);) receive(grpc_stream::Update(buffer));
+            for (grpc_stream::Buffer buffer; call_->Read(&buffer);) receive(grpc_stream::flat(buffer));
         } catch (const Error&) {
             context_->TryCancel();
             call_->Finish();
             throw;
         }
         const ::grpc::Status status = call_->Finish();
-        if (status.ok()) return Error("ended", server_ + " has ended the stream");
         const auto& metadata = context_->GetServerTrailingMetadata();
-        if (const auto led = metadata.find("clearway-served-at"); led != metadata.end() && !std::exchange(is_led_, true)) {
-            server_ = std::string(led->second.data(), led->second.size());
-            return receive_stream();
-        }
-        return Error(grpc_stream::name_of(status.error_code()), server_ + ": " + status.error_message());
+        const auto served_at = metadata.find("clearway-served-at");
+        if (served_at == metadata.end() || std::exchange(is_led_, true)) return grpc_stream::ended(server_, status);
+        // The server that serves the vehicle.
+        server_ = std::string(served_at->second.data(), served_at->second.size());
+        return receive_stream();
     }
 
     // Receives streams until the last one has ended.
     void receive_streams() {
-        using namespace grpc_stream;
-        auto pause = PAUSE_MIN;
+        auto pause = grpc_stream::PAUSE_MIN;
         while (true) {
             const auto before = newest_;
             std::optional<Error> ended;
             bool is_last = !wanted_.reconnects;
             try {
                 ended = receive_stream();
-                is_last = is_last || is_lasting(*ended);
+                is_last = is_last || grpc_stream::is_lasting(*ended);
             } catch (const Error& refused) {
                 ended = refused;
                 is_last = true;
@@ -292,7 +289,7 @@ private:
                 return changed_.notify_all();
             }
             reasons_ = {ended->what()};
-            pause = newest_ == before ? std::min(2 * pause, PAUSE_MAX) : PAUSE_MIN;
+            pause = newest_ == before ? std::min(2 * pause, grpc_stream::PAUSE_MAX) : grpc_stream::PAUSE_MIN;
             changed_.wait_for(lock, pause, [&] { return is_closed_; });
         }
     }

@@ -144,7 +144,7 @@ public:
         if (const Layer* found = find(name)) return *found;
         std::string present;
         for (const Layer& layer : layers) present += (present.empty() ? "" : ", ") + layer.name;
-        throw Error("layer", "no layer '" + std::string(name) + "'; this map has " + present);
+        fail("layer", "no layer '", name, "'; this map has ", present);
     }
 
     // Sets the time at which the map came from a server. Call it once, when its bytes arrive.
