@@ -333,6 +333,11 @@ impl Reach {
         &self.obstacles
     }
 
+    /// By polar cell: true if an obstacle stands in it.
+    pub(crate) fn has_obstacle(&self) -> &[bool] {
+        &self.has_obstacle
+    }
+
     /// The polar cell of a cell's centre.
     pub(crate) fn polar(&self, cell: usize) -> PolarIndex {
         self.polar_of_cell[cell]

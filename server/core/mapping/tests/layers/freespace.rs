@@ -196,6 +196,19 @@ fn mirror_images_under_the_feet_of_a_person_change_nothing() {
 }
 
 #[test]
+fn behind_a_thing_whose_front_rises_like_ground_is_no_drop() {
+    for front in [0.2, 0.25, 0.3] {
+        let thing = |x: f32, y: f32, z: f32| {
+            let height_m = if x < 10.3 { (front * (x - 9.0)).min(0.65) } else { 0.65 };
+            z <= if (9.0..11.0).contains(&x) && (3.5..6.5).contains(&y) { height_m } else { 0.0 }
+        };
+        let layer = freespace(&cast(Model::Hdl64eS2, thing));
+        assert_eq!(count(&layer, FreespaceClass::Drop, [5.0, 30.0], [-5.0, 20.0]), 0, "{front}");
+        assert_eq!(count(&layer, FreespaceClass::Free, [10.3, 11.0], [4.0, 6.0]), 0, "{front}");
+    }
+}
+
+#[test]
 fn on_a_dam_the_road_is_free_and_its_edges_are_closed() {
     for (model, depth_m) in [(Model::Hdl64eS2, 0.4), (Model::Hdl64eS2, 0.8), (Model::Hdl32e, 0.6), (Model::Vlp16, 0.6)]
     {

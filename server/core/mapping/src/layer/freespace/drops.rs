@@ -41,6 +41,8 @@ const WHEELS_M_MIN: f32 = 0.25;
 const WHEELS_SHARE: f32 = 0.1;
 /// How far a drop reaches beyond its two returns, metres. Ours: half a cell, and a cell.
 const EDGES_M: [f32; 2] = [0.1, 0.25];
+/// Depth of what stands before a drop, and distance of what stands beyond it, metres. Ours; not tuned.
+const STANDING_M: f32 = 0.3;
 /// Number of steps of a cell's side that are kept of a column: bits of a number.
 const STEPS: usize = 128;
 
@@ -75,7 +77,7 @@ impl Drops {
     pub fn find(&mut self, ground: &Ground, reach: &Reach, sensor_m: f32) -> &Bits {
         for column in 0..COLUMNS {
             self.sort_returns(ground, column, sensor_m);
-            self.spans[column] = self.span(ground, column, reach.config().clearance_m + DEPTH_OVER_M);
+            self.spans[column] = self.span(ground, reach, column);
         }
         self.mark(reach);
         let Self { found, beside, blind_zone, .. } = self;
@@ -102,7 +104,8 @@ impl Drops {
     }
 
     /// The bits of a column's drops.
-    fn span(&self, ground: &Ground, column: usize, depth_m_min: f32) -> u128 {
+    fn span(&self, ground: &Ground, reach: &Reach, column: usize) -> u128 {
+        let depth_m_min = reach.config().clearance_m + DEPTH_OVER_M;
         let first = self.returns.first().filter(|first| is_below_vehicle(ground, self.directions[column], first));
         let mut span = first.map_or(0, |first| bits(0.0, first.range_m + EDGES_M[1]));
         for (at, pair) in self.returns.windows(2).enumerate() {
@@ -112,7 +115,8 @@ impl Drops {
                 continue;
             }
             let line_m = before.z_m + self.slope(at) * gap_m;
-            if line_m - after.z_m > depth_m_min.max(DEPTH_SHARE_MIN * gap_m) {
+            let is_deep = line_m - after.z_m > depth_m_min.max(DEPTH_SHARE_MIN * gap_m);
+            if is_deep && !is_hidden(reach, column, [before, after]) {
                 span |= bits(before.range_m + EDGES_M[0], after.range_m + EDGES_M[1]);
             }
         }
@@ -161,6 +165,14 @@ fn is_below_vehicle(ground: &Ground, [cos, sin]: [f32; 2], first: &Return) -> bo
     let depth_m = plane.height_m(range_m * cos, range_m * sin) - z_m;
     let is_below_plane = plane.is_seen && depth_m > FIRST_DEPTH_M_MIN.max(FIRST_SHARE_MIN * range_m);
     range_m < FIRST_M_MAX && (is_below_plane || -z_m > WHEELS_M_MIN + WHEELS_SHARE * range_m)
+}
+
+/// True if an obstacle stands on the way from one return to the next: what looks like ground before a drop may be a
+/// part of the obstacle, such as the front of a car, beside which the next ray passes.
+fn is_hidden(reach: &Reach, column: usize, [before, after]: [Return; 2]) -> bool {
+    let way = before.range_m - STANDING_M..after.range_m - STANDING_M;
+    let rows = (0..ROWS).filter(|row| way.start < row_start_m(*row + 1) && row_start_m(*row) < way.end);
+    rows.map(|row| row * COLUMNS + column).any(|cell| reach.has_obstacle()[cell])
 }
 
 /// The bits from one range to another one.
