@@ -1,4 +1,4 @@
-// Maps of one vehicle over gRPC: `HOST:PORT` -> the newest map, again and again.
+// Maps of one vehicle over gRPC: the address of a server -> a stream of the newest maps.
 //
 // A stream has one map in flight and acknowledges it when the reader asks for the next one, so the server holds the
 // newest map for the reader, and skips and counts those between. Messages are read and written as bytes: no generated
@@ -126,8 +126,8 @@ inline bool is_lasting(const Error& ended) {
 
 }  // namespace grpc_stream
 
-// The newest map of a vehicle, again and again; a thread receives it. The stream ends when it is destroyed. `next` is
-// for one thread.
+// Stream of a vehicle's newest maps, which a thread of its own receives. It ends when it is destroyed. `next`, `skipped`
+// and `left_out` are for one thread.
 class MapStream {
 public:
     // Begins to connect to `HOST:PORT`, in plain text or with the certificates of `grpc::SslCredentials`.
@@ -264,7 +264,7 @@ private:
         const auto& metadata = context_->GetServerTrailingMetadata();
         const auto served_at = metadata.find("clearway-served-at");
         if (served_at == metadata.end() || std::exchange(is_led_, true)) return grpc_stream::ended(server_, status);
-        // The server that serves the vehicle.
+        // The server at this address serves the vehicle.
         server_ = std::string(served_at->second.data(), served_at->second.size());
         return receive_stream();
     }
