@@ -1,5 +1,5 @@
 //! Measures each stage of a revolution of an HDL-64E on one thread, in turn with a floor: the least work on the same
-//! data that could do it.
+//! data that could do it. Times are processor times of the thread, which the load of other programs changes little.
 //!
 //!   cargo bench -p clearway-tests --no-default-features --bench stages       a simulated scan of a town
 //!   cargo bench ... --bench stages -- SCAN.bin --height 1.73                 a scan in KITTI's format
@@ -13,6 +13,7 @@
 //! | occupancy_six_units | the scans of six sensors in 100 ms -> the layer | |
 //! | maps | a scan event -> a map of all six layers | |
 //! | shared | a scan -> its points, their ground and reach: what all layers have in common | |
+//! | freespace | a scan event -> the bytes of `freespace`, when nothing else is wanted | |
 //! | encode | a map of six layers -> the bytes of each, with all channels | the runs of six grids of 160,000 cells |
 //!
 //! The first rounds, in which buffers get their sizes, are not counted.
@@ -22,7 +23,7 @@ use std::hint::black_box;
 use std::io::{BufRead, stdin};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clap::Parser;
 use clearway_journal::encode::EncodedMap;
@@ -44,6 +45,7 @@ use clearway_sim::scenes::town;
 use clearway_sim::traffic;
 use clearway_sim::vehicle::{Kind, SimulatedVehicle};
 use nalgebra::Isometry3;
+use nix::time::ClockId;
 
 /// Rounds before the first that counts.
 const WARM_UP: u32 = 6;
@@ -110,11 +112,16 @@ fn median_ms(times: &mut [Duration]) -> Option<f64> {
     times.get(times.len() / 2).map(|time| time.as_secs_f64() * 1e3)
 }
 
+/// Processor time of this thread.
+fn thread_time() -> Duration {
+    ClockId::CLOCK_THREAD_CPUTIME_ID.now().expect("the thread's clock").into()
+}
+
 /// Runs `work` and takes its time; what it returns is dropped after that.
 fn timed<T>(work: impl FnOnce() -> T) -> Duration {
-    let start = Instant::now();
+    let start = thread_time();
     let result = black_box(work());
-    let time = start.elapsed();
+    let time = thread_time() - start;
     drop(result);
     time
 }
@@ -134,7 +141,7 @@ struct Stages {
 }
 
 impl Stages {
-    const NAMES: [&'static str; 11] = [
+    const NAMES: [&'static str; 12] = [
         "decode",
         "drivability",
         "height_difference",
@@ -145,6 +152,7 @@ impl Stages {
         "occupancy_six_units",
         "shared",
         "maps",
+        "freespace",
         "encode",
     ];
 
@@ -161,11 +169,11 @@ impl Stages {
             }
             None => (Scan::from(&vehicle.revolution(1)), 1.9),
         };
-        let layers_of = |stage: &str| match LAYERS.iter().find(|layer| **layer == stage) {
-            Some(alone) => vec![*alone],
-            None => LAYERS.to_vec(),
+        let layers_of = |stage: &'static str| match stage {
+            "maps" | "encode" => LAYERS.to_vec(),
+            alone => vec![alone],
         };
-        let of_maps = LAYERS.into_iter().chain(["maps", "encode"]);
+        let of_maps = LAYERS.into_iter().chain(["maps", "freespace", "encode"]);
         Self {
             datagrams: datagrams.map(|datagram| datagram.payload.into()).collect(),
             decoder: Sensor::new(LidarConfig { model: Some(Model::Hdl64eS2), ..LidarConfig::default() }),
@@ -201,12 +209,15 @@ impl Stages {
                 let pose = EgoPose { stamp_ns, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };
                 pipeline.step(&event(Body::EgoPose(pose))).expect("a pose");
                 let scan = event(Body::Scan(Scan { stamp_ns, ..self.scan.clone() }));
-                let start = Instant::now();
+                let start = thread_time();
                 let map = pipeline.step(&scan).expect("a scan").expect("a map");
-                if name != "encode" {
-                    return start.elapsed();
+                let making = thread_time() - start;
+                let encoding = timed(|| EncodedMap::new(map, "car".into(), 1, 300));
+                match name {
+                    "encode" => encoding,
+                    "freespace" => making + encoding,
+                    _ => making,
                 }
-                timed(|| EncodedMap::new(map, "car".into(), 1, 300))
             }
         }
     }

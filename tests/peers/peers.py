@@ -49,7 +49,7 @@ WARM_UP = 6
 SHARES = [1.0, 0.5, 0.25, 0.125]
 # The ratios to Patchwork++ that Clearway aims at, greatest allowed.
 SHARE = ", its share"
-TARGETS = {"all": 0.45, f"drivability{SHARE}": 0.08, f"terrain{SHARE}": 0.2, "occupancy_six_units": 0.1}
+TARGETS = {"all": 0.45, "freespace": 0.3, f"drivability{SHARE}": 0.08, f"terrain{SHARE}": 0.2, "occupancy_six_units": 0.1}
 # How much faster than velodyne-decoder Clearway aims to decode.
 DECODE_TARGET = 5
 
@@ -80,9 +80,10 @@ class Clearway:
 
 
 def timed(work):
-    start = time.perf_counter()
+    """Milliseconds of processor time of this thread."""
+    start = time.thread_time()
     work()
-    return (time.perf_counter() - start) * 1e3
+    return (time.thread_time() - start) * 1e3
 
 
 def peers(points, height_m, packets):
@@ -97,9 +98,7 @@ def peers(points, height_m, packets):
         parameters = pypatchworkpp.Parameters()
         parameters.sensor_height = height_m
         segmenter = pypatchworkpp.patchworkpp(parameters)
-        segmenter.estimateGround(points)
-        # Its own clock, without the copies between Python and C++.
-        return segmenter.getTimeTaken() / 1e3
+        return timed(lambda: segmenter.estimateGround(points))
 
     xyz = numpy.ascontiguousarray(points[:, :3])
     line_fit = linefit.ground_seg()
@@ -113,7 +112,7 @@ def peers(points, height_m, packets):
     return {
         "patchwork++": patchwork,
         "linefit": lambda: timed(lambda: line_fit.run(xyz)),
-        "travel": lambda: travel.estimate_ground(points)[1] * 1e3,
+        "travel": lambda: timed(lambda: travel.estimate_ground(points)),
         "velodyne-decoder": lambda: timed(lambda: decoder.decode(revolution)),
     }
 

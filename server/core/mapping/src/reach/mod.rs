@@ -34,6 +34,7 @@ mod steps;
 mod troughs;
 
 use std::ops::Range;
+use std::sync::{Arc, LazyLock};
 
 use crate::ground::Ground;
 use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside, row_middles_m};
@@ -51,7 +52,7 @@ use flood::Flood;
 use joins::Joins;
 use obstacles::Obstacles;
 use polar_runs::{PolarRuns, WORD};
-use shadow::Shadow;
+use shadow::{Place, Shadow};
 use steps::Steps;
 use troughs::Troughs;
 
@@ -115,14 +116,33 @@ pub(crate) struct ReachBits<'a> {
     pub seen: &'a Bits,
 }
 
-/// Closed cells and reached ground around the vehicle, ego frame.
-#[derive(Clone)]
-pub struct Reach {
-    config: ReachConfig,
+/// Where the cells lie: the same for every vehicle.
+struct Places {
     /// By cell: the polar cell of its centre.
     polar_of_cell: Vec<PolarIndex>,
     polar_runs: PolarRuns,
     row_middles_m: [f32; ROWS],
+    of_shadows: Arc<[Place]>,
+    directions: Directions,
+}
+
+static PLACES: LazyLock<Places> = LazyLock::new(|| {
+    let centres_m = || (0..SIDE * SIDE).map(cells::centre_m);
+    let polar_of_cell: Vec<_> = centres_m().map(|[x, y]| PolarIndex::at(x, y)).collect();
+    Places {
+        polar_runs: PolarRuns::new(&polar_of_cell),
+        polar_of_cell,
+        row_middles_m: row_middles_m(),
+        of_shadows: centres_m().map(Place::at).collect(),
+        directions: Directions::new(),
+    }
+});
+
+/// Closed cells and reached ground around the vehicle, ego frame.
+#[derive(Clone)]
+pub struct Reach {
+    config: ReachConfig,
+    places: &'static Places,
     /// Indices of the cells under the vehicle.
     under_vehicle: Vec<usize>,
     obstacles: Obstacles,
@@ -153,7 +173,6 @@ pub struct Reach {
     edges: Edges,
     /// Closed cells, those between two cells beside a step, and those on the continuation of an edge.
     barred: Bits,
-    directions: Directions,
     flood: Flood,
 }
 
@@ -164,18 +183,15 @@ impl Reach {
         let outline = Outline { width_m: config.vehicle_width_m.min(STRIP_M), ..config.outline() };
         let centres_m = (0..SIDE * SIDE).map(|cell| (cell, cells::centre_m(cell)));
         let bits = Bits::square(SIDE);
-        let polar_of_cell: Vec<_> = centres_m.clone().map(|(_, [x, y])| PolarIndex::at(x, y)).collect();
         Self {
             config: config.clone(),
-            polar_runs: PolarRuns::new(&polar_of_cell),
-            polar_of_cell,
-            row_middles_m: row_middles_m(),
+            places: &PLACES,
             under_vehicle: centres_m.filter(|(_, [x, y])| outline.contains(*x, *y)).map(|(cell, _)| cell).collect(),
             obstacles: Obstacles::new(),
             steps: Steps::new(),
             seen_now: bits.clone(),
             troughs: Troughs::new(),
-            shadow: Shadow::new((0..SIDE * SIDE).map(cells::centre_m)),
+            shadow: Shadow::new(Arc::clone(&PLACES.of_shadows)),
             has_obstacle: vec![false; CELLS],
             views: vec![View::Closed; CELLS],
             open: bits.clone(),
@@ -191,7 +207,6 @@ impl Reach {
             blind_zone: BlindZone::new(),
             edges: Edges::new(),
             barred: bits,
-            directions: Directions::new(),
             flood: Flood::new(SIDE),
         }
     }
@@ -224,7 +239,7 @@ impl Reach {
         closed.add(in_trough);
         self.barred.copy_from(closed);
         let barred = &mut self.barred;
-        self.joins.find(closed, &self.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
+        self.joins.find(closed, &self.places.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
         let obstacle_m = |cell| self.obstacles.height_m(cell);
         self.blind_zone.find(closed, obstacle_m, ground.confidences(), |ix, iy| barred.set(ix, iy));
         let plane = ground.near_plane();
@@ -239,8 +254,8 @@ impl Reach {
         }
         self.open_seen_ground(sweep.mount_height_m, ground.confidences());
         let radius = self.disc_radius();
-        self.flood.run(&self.open, &self.barred, radius, self.directions.near());
-        self.directions.close(&self.open, &mut self.flood);
+        self.flood.run(&self.open, &self.barred, radius, self.places.directions.near());
+        self.places.directions.close(&self.open, &mut self.flood);
     }
 
     /// Sorts the points into those of obstacles and those of the ground; the vehicle's own obstacles are left out.
@@ -340,20 +355,20 @@ impl Reach {
 
     /// The polar cell of a cell's centre.
     pub(crate) fn polar(&self, cell: usize) -> PolarIndex {
-        self.polar_of_cell[cell]
+        self.places.polar_of_cell[cell]
     }
 
     /// Writes the lowest bit of the value of each cell's polar cell.
     pub(crate) fn copy_polar(&self, value_of: impl Fn(PolarIndex) -> u8 + Copy, cells: &mut Bits) {
-        cells.fill_words(|of_word| self.polar_runs.bits::<1>(of_word.start / WORD, value_of)[0]);
+        cells.fill_words(|of_word| self.places.polar_runs.bits::<1>(of_word.start / WORD, value_of)[0]);
     }
 
     /// Floods the ground again with more barred cells; `flood` and `barred` are the caller's.
     pub(crate) fn flood_with(&self, barriers: [&Bits; 2], barred: &mut Bits, flood: &mut Flood) {
         barred.copy_from(&self.barred);
         barriers.into_iter().for_each(|barrier| barred.add(barrier));
-        flood.run(&self.open, barred, self.disc_radius(), self.directions.near());
-        self.directions.close(&self.open, flood);
+        flood.run(&self.open, barred, self.disc_radius(), self.places.directions.near());
+        self.places.directions.close(&self.open, flood);
     }
 
     /// Radius, in cells, of the largest disc sure to fit through a passage of the vehicle's width.
@@ -367,14 +382,14 @@ impl Reach {
         self.shadow.clear();
         self.has_obstacle.fill(false);
         for (cell, span_m) in self.obstacles.cells() {
-            if let Some(polar) = self.polar_of_cell[cell].index() {
+            if let Some(polar) = self.places.polar_of_cell[cell].index() {
                 self.has_obstacle[polar] = true;
             }
-            self.shadow.cast(cell, CELL_M, span_m, sensor_m);
+            self.shadow.cast(cells::centre_m(cell), CELL_M, span_m, sensor_m);
         }
         self.classify_polar_cells(confidences);
         self.assume_near_ground(confidences);
-        let (runs, shadow, views) = (&self.polar_runs, &self.shadow, &self.views);
+        let (runs, shadow, views) = (&self.places.polar_runs, &self.shadow, &self.views);
         let (hidden, gaps) = (&mut self.hidden, &mut self.hidden_gaps);
         self.open.fill_words(|cells| {
             let view_of = |polar: PolarIndex| polar.of(views).map_or(View::Closed as u8, |view| *view as u8);
@@ -399,7 +414,7 @@ impl Reach {
     /// Opens the hidden cells in gaps of seen ground that a closing of the open cells fills: the thin shadows of trunks
     /// and bushes, which would cut the way of the disc's middle. Near ground alone: [`Directions::near`].
     fn open_thin_shadows(&mut self) {
-        let Self { open, hidden_gaps, dilated, outside, wide, directions, .. } = self;
+        let Self { open, hidden_gaps, dilated, outside, wide, places, .. } = self;
         dilated.clear();
         dilated.dilate(open, CLOSING, wide);
         dilated.invert();
@@ -407,7 +422,7 @@ impl Reach {
         outside.dilate(dilated, CLOSING, wide);
         hidden_gaps.remove(outside);
         // Farther away a fence returns nothing between its posts, and shadows would lead on behind it.
-        directions.near().last().into_iter().for_each(|near| hidden_gaps.keep(near));
+        places.directions.near().last().into_iter().for_each(|near| hidden_gaps.keep(near));
         open.add(hidden_gaps);
     }
 
@@ -435,7 +450,8 @@ impl Reach {
 
     /// Opens the ground before the first ground that was seen in each direction, if the configuration allows it so far.
     fn assume_near_ground(&mut self, confidences: &[Confidence]) {
-        let rows = self.row_middles_m.iter().take_while(|range_m| **range_m <= self.config.assumed_ground_m).count();
+        let rows =
+            self.places.row_middles_m.iter().take_while(|range_m| **range_m <= self.config.assumed_ground_m).count();
         for column in 0..COLUMNS {
             let first = (0..rows).find(|row| {
                 let cell = row * COLUMNS + column;

@@ -5,6 +5,7 @@
 //! continuation of a fence. The sensor is assumed to be above the ego origin, as in the radial layers.
 
 use std::f32::consts::TAU;
+use std::sync::Arc;
 
 /// Number of azimuths about the vehicle. Ours: 90 degrees are a whole number of azimuths, and no centre of a cell lies
 /// on the border between two.
@@ -23,30 +24,33 @@ const HEIGHT_M_MIN: f32 = 0.5;
 
 /// Place of a cell's centre, in half the bytes of its azimuth and distance.
 #[derive(Clone, Copy, Debug)]
-struct Place {
+pub struct Place {
     azimuth: u16,
     step: u8,
+}
+
+impl Place {
+    /// The place of a position.
+    pub fn at([x, y]: [f32; 2]) -> Self {
+        let azimuth = (libm::atan2f(y, x) / TAU * AZIMUTHS as f32 + AZIMUTHS as f32 + 0.5) as usize % AZIMUTHS;
+        let step = ((x * x + y * y).sqrt() * STEPS_A_M).min((STEPS - 1) as f32);
+        Self { azimuth: azimuth as u16, step: step as u8 }
+    }
 }
 
 /// Shadows on the ground by azimuth and distance.
 #[derive(Clone, Debug)]
 pub struct Shadow {
-    /// By cell: distance of its centre, metres.
-    distances_m: Vec<f32>,
-    /// By cell: azimuth and distance step of its centre.
-    places: Vec<Place>,
+    /// By cell.
+    places: Arc<[Place]>,
     /// By azimuth: one bit for each distance step, set if it is hidden.
     hidden: Vec<u128>,
 }
 
 impl Shadow {
-    /// Shadows on cells with these centres; none yet.
-    pub fn new(centres_m: impl Iterator<Item = [f32; 2]>) -> Self {
-        let (azimuths, distances_m): (Vec<u16>, Vec<f32>) = centres_m.map(polar).unzip();
-        let step = |distance_m: f32| (distance_m * STEPS_A_M).min((STEPS - 1) as f32) as u8;
-        let place = |(azimuth, distance_m): (u16, &f32)| Place { azimuth, step: step(*distance_m) };
-        let places = azimuths.into_iter().zip(&distances_m).map(place).collect();
-        Self { distances_m, places, hidden: vec![0; AZIMUTHS] }
+    /// Shadows on cells with these places; none yet.
+    pub fn new(places: Arc<[Place]>) -> Self {
+        Self { places, hidden: vec![0; AZIMUTHS] }
     }
 
     /// Removes all shadows.
@@ -54,14 +58,14 @@ impl Shadow {
         self.hidden.fill(0);
     }
 
-    /// Adds the shadow, if it casts one, of an obstacle that spans these heights in a cell of this size, with the
-    /// sensor at height `sensor_m`.
-    pub fn cast(&mut self, cell: usize, cell_m: f32, [lowest_m, highest_m]: [f32; 2], sensor_m: f32) {
+    /// Adds the shadow, if it casts one, of an obstacle that spans these heights in a cell of this size with its centre
+    /// at this position, with the sensor at height `sensor_m`.
+    pub fn cast(&mut self, [x, y]: [f32; 2], cell_m: f32, [lowest_m, highest_m]: [f32; 2], sensor_m: f32) {
         let under_m = if lowest_m < UNDER_M_MIN { 0.0 } else { lowest_m };
         if highest_m - under_m < HEIGHT_M_MIN {
             return;
         }
-        let (azimuth, distance_m) = (self.places[cell].azimuth, self.distances_m[cell]);
+        let (azimuth, distance_m) = (Place::at([x, y]).azimuth, (x * x + y * y).sqrt());
         // Distance at which the ray over a height meets the ground.
         let meets = |height_m: f32| {
             if height_m < sensor_m { distance_m * sensor_m / (sensor_m - height_m) } else { f32::INFINITY }
@@ -86,12 +90,6 @@ impl Shadow {
     }
 }
 
-/// Azimuth step and distance of a position.
-fn polar([x, y]: [f32; 2]) -> (u16, f32) {
-    let azimuth = (libm::atan2f(y, x) / TAU * AZIMUTHS as f32 + AZIMUTHS as f32 + 0.5) as usize % AZIMUTHS;
-    (azimuth as u16, (x * x + y * y).sqrt())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -100,9 +98,9 @@ mod tests {
     fn a_low_wall_hides_the_ground_behind_it_and_a_branch_the_ground_farther_on() {
         let centre = |cell: usize| [cell as f32 * 0.5 + 0.25, 0.25];
         let shadow = |span_m: [f32; 2]| {
-            let mut shadow = Shadow::new((0..120).map(centre));
+            let mut shadow = Shadow::new((0..120).map(|cell| Place::at(centre(cell))).collect());
             // 10.25 m away; a sensor at 2 m looks over 1 m of it at 20.5 m.
-            shadow.cast(20, 0.5, span_m, 2.0);
+            shadow.cast(centre(20), 0.5, span_m, 2.0);
             (0..120).filter(|cell| shadow.hides(*cell)).map(|cell| centre(cell)[0]).collect::<Vec<f32>>()
         };
         let wall = shadow([0.0, 1.0]);
@@ -117,16 +115,16 @@ mod tests {
 
     #[test]
     fn a_shadow_is_as_wide_as_the_obstacle_that_casts_it() {
-        // Cells 15 m away in a row across the shadow of a wall in cell 0, which is 10 m away.
+        // Cells 15 m away in a row across the shadow of a wall 10 m away.
         let across = |step: usize| [15.0, (step as f32 - 20.0) * 0.1];
-        let mut shadow = Shadow::new(std::iter::once([10.0, 0.0]).chain((0..41).map(across)));
-        shadow.cast(0, 0.5, [0.0, 1.5], 2.0);
+        let mut shadow = Shadow::new((0..41).map(|step| Place::at(across(step))).collect());
+        shadow.cast([10.0, 0.0], 0.5, [0.0, 1.5], 2.0);
         // 0.5 m at 10 m are 0.75 m at 15 m, up to the width of an azimuth on each side.
         let slack_m = TAU / AZIMUTHS as f32 * 15.0;
         for step in 0..41 {
             let aside_m = across(step)[1].abs();
-            assert!(shadow.hides(1 + step) || aside_m > 0.375 - slack_m, "{aside_m} m aside is hidden");
-            assert!(!shadow.hides(1 + step) || aside_m < 0.375 + slack_m, "{aside_m} m aside is seen");
+            assert!(shadow.hides(step) || aside_m > 0.375 - slack_m, "{aside_m} m aside is hidden");
+            assert!(!shadow.hides(step) || aside_m < 0.375 + slack_m, "{aside_m} m aside is seen");
         }
     }
 }
