@@ -7,6 +7,7 @@
 //! | `clearway_python` | `python3` with the modules `venv` and `ensurepip` |
 //! | `clearway_npm` | `npm`, which installs `buf` |
 //! | `clearway_cpp` | a compiler of C++, `c++` |
+//! | `clearway_cpp_grpc` | also `cmake`, and gRPC's library for C++ |
 //! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
 //! | `clearway_deploy` | the tools that lint and start `deploy/`: those of [`DEPLOY`], as root |
 //! | `clearway_namespaces` | what `machines` needs: those of [`NAMESPACES`], as root, and `/dev/net/tun` |
@@ -62,7 +63,10 @@ fn main() {
     println!("cargo::rustc-env=CLEARWAY_DRIVES={}", data.unwrap_or_default().display());
     set("clearway_python", succeeds("python3", &["-c", "import venv, ensurepip"]));
     set("clearway_npm", succeeds("npm", &["--version"]));
-    set("clearway_cpp", succeeds("c++", &["--version"]));
+    let has_cpp = succeeds("c++", &["--version"]);
+    set("clearway_cpp", has_cpp);
+    let has_grpc = succeeds("pkg-config", &["--exists", "grpc++", "protobuf"]);
+    set("clearway_cpp_grpc", has_cpp && has_grpc && succeeds("cmake", &["--version"]));
     set("clearway_openssl", succeeds("openssl", &["version"]));
     set("clearway_promtool", succeeds("promtool", &["--version"]));
     let can_deploy = DEPLOY.iter().all(|(program, arguments)| succeeds(program, arguments));

@@ -9,7 +9,16 @@
 //   arc <layer> <outline> <curvature> <length>                of a path; so does `places <layer> <outline> <x> <y> ...`
 //   nearest_obstacle <layer> <x> <y> [<outline>]              so does `nearest_low`
 //   clearance <layer> <most> <passes low things: 0 or 1>
+//
+// With the macro CLEARWAY_STREAM also, of a server:
+//
+//   watch <address> <once, or reconnects> <deltas: 0 or 1> <layer> ...   opens a stream of maps
+//   next                                                      waits for a map or for STALE; the map of the questions
+//   reasons                                                   why no map comes
 #include <clearway/questions.hpp>
+#ifdef CLEARWAY_STREAM
+#include <clearway/grpc.hpp>
+#endif
 
 #include <cstdlib>
 #include <iostream>
@@ -155,8 +164,36 @@ struct Words {
     }
 };
 
+#ifdef CLEARWAY_STREAM
+// The answer to a request about a stream; none if it is another request.
+std::optional<std::string> answered_by_stream(const std::string& ask, Words& words, Map& map) {
+    static std::optional<MapStream> stream;
+    if (ask == "watch") {
+        const std::string address = words.word();
+        Subscription wanted;
+        wanted.reconnects = words.word() == "reconnects";
+        wanted.deltas = words.word() == "1";
+        while (words.has_more()) wanted.layers.push_back(words.word());
+        stream.emplace(address, wanted);
+        return "null";
+    }
+    if (ask == "next") {
+        map = *stream->next();
+        const bool is_stale = map.is_stale(Clocks::now());
+        return "[" + std::to_string(map.header.boot_id) + "," + std::to_string(map.header.sequence) + "," +
+               std::to_string(stream->skipped()) + "," + std::to_string(stream->left_out()) + "," +
+               (is_stale ? "true" : "false") + "]";
+    }
+    if (ask == "reasons") return list(stream->reasons(), hex);
+    return std::nullopt;
+}
+#else
+std::optional<std::string> answered_by_stream(const std::string&, Words&, Map&) { return std::nullopt; }
+#endif
+
 std::string answered(Words& words, Map& map) {
     const std::string ask = words.word();
+    if (const auto answer = answered_by_stream(ask, words, map)) return *answer;
     if (ask == "map") {
         const std::string base = words.word(), bytes = from_hex(words.word());
         if (base == "-") return show(Map::decode(bytes));
@@ -172,7 +209,6 @@ std::string answered(Words& words, Map& map) {
         raw.crc32 = static_cast<std::uint32_t>(std::stoul(words.word()));
         const std::string payload = from_hex(words.word());
         raw.payload = payload;
-        decoding::check_count(raw);
         const Cells cells = decoding::decode_cells(raw, columns, std::nullopt);
         return list(cells, [](std::int32_t cell) { return std::to_string(cell); });
     }

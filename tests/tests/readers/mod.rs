@@ -5,6 +5,7 @@ mod browsers;
 mod cpp;
 mod interrupted;
 mod nav2;
+mod planners;
 mod python;
 mod streams;
 mod viewers;

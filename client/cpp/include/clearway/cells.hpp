@@ -1,28 +1,19 @@
 // The cells of a channel from its payload, as `proto/src/channel` and `client/python/clearway/codec.py` decode them.
 //
 // In: a channel's claims and its payload, also hostile ones. Out: raw cells in the order of the cell index, or an
-// `Error` "cells". What a channel claims is checked before memory for its cells is allocated. The CRC decides whether
-// the cells are right; that a payload is canonical is not checked. Format: `proto/clearway/v1/map.proto`, `Encoding`.
+// `Error` "cells". The caller bounds the number of cells. The CRC decides whether the cells are right; that
+// a payload is canonical is not checked. Format: `proto/clearway/v1/map.proto`, `Encoding`.
 #pragma once
 
 #include <algorithm>
 #include <array>
 
-#include "wire.hpp"
+#include "map.hpp"
 
-namespace clearway {
-
-// Type of a raw cell, as on the wire.
-enum class CellType : std::int32_t { U8 = 1, I8 = 2, U16 = 3 };
-
-// Raw values in the order of the cell index, whatever their type.
-using Cells = std::vector<std::int32_t>;
-
-namespace codec {
+namespace clearway::codec {
 
 enum Encoding : std::int32_t { RAW = 1, ROWS = 2, CHANGES = 3 };
 
-[[noreturn]] inline void refuse(const std::string& what) { throw Error("cells", what); }
 
 inline std::size_t bytes_of(CellType type) { return type == CellType::U16 ? 2 : 1; }
 
@@ -35,31 +26,25 @@ inline std::int32_t wrapped(CellType type, std::uint32_t number) {
 
 // Raw little-endian cells.
 inline Cells raw(Bytes payload, CellType type) {
-    Cells cells(payload.size() / bytes_of(type));
-    for (std::size_t at = 0; at < cells.size(); ++at) {
-        const auto byte = [&](std::size_t index) {
-            return static_cast<std::uint32_t>(static_cast<unsigned char>(payload[index]));
-        };
-        cells[at] = wrapped(type, type == CellType::U16 ? byte(2 * at) | byte(2 * at + 1) << 8 : byte(at));
+    Cells cells;
+    for (const std::size_t size = bytes_of(type); payload.size() >= size; payload.remove_prefix(size)) {
+        std::uint32_t number = 0;
+        for (std::size_t byte = size; byte-- > 0;) number = number << 8 | static_cast<unsigned char>(payload[byte]);
+        cells.push_back(wrapped(type, number));
     }
     return cells;
 }
 
 // CRC-32 (IEEE) of the raw little-endian cells.
 inline std::uint32_t crc32(const Cells& cells, CellType type) {
-    static const auto table = [] {
-        std::array<std::uint32_t, 256> made{};
-        for (std::uint32_t byte = 0; byte < 256; ++byte) {
-            made[byte] = byte;
-            for (int bit = 0; bit < 8; ++bit) made[byte] = made[byte] >> 1 ^ (made[byte] & 1 ? 0xedb88320u : 0);
-        }
-        return made;
-    }();
+    constexpr std::uint32_t OF_FOUR_BITS[16] = {
+        0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4, 0x4db26158, 0x5005713c,
+        0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c, 0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c};
     std::uint32_t crc = ~0u;
     for (const std::int32_t cell : cells) {
-        const auto bits = static_cast<std::uint32_t>(cell);
-        crc = crc >> 8 ^ table[(crc ^ bits) & 0xff];
-        if (type == CellType::U16) crc = crc >> 8 ^ table[(crc ^ bits >> 8) & 0xff];
+        for (std::size_t shift = 0; shift < 8 * bytes_of(type); shift += 4) {
+            crc = crc >> 4 ^ OF_FOUR_BITS[(crc ^ static_cast<std::uint32_t>(cell) >> shift) & 15];
+        }
     }
     return ~crc;
 }
@@ -70,7 +55,7 @@ public:
     Bits(Bytes payload, CellType type) : payload_(payload), type_(type) {}
 
     bool bit() {
-        if (at_ / 8 >= payload_.size()) refuse("the payload ends inside the cells, after " + length() + " bytes");
+        require(at_ / 8 < payload_.size(), "cells", "the cells end after the payload of ", payload_.size(), " bytes");
         const bool bit = static_cast<unsigned char>(payload_[at_ / 8]) >> (7 - at_ % 8) & 1;
         ++at_;
         return bit;
@@ -79,9 +64,7 @@ public:
     // A number in exp-Golomb code of an order: code `N` if that is 0.
     std::uint64_t number(unsigned order = 0) {
         unsigned bits = order;
-        while (!bit()) {
-            if (++bits > NUMBER_BITS_MAX) refuse("a number exceeds " + std::to_string(NUMBER_BITS_MAX) + " bits");
-        }
+        while (!bit()) require(++bits <= NUMBER_BITS_MAX, "cells", "a number exceeds ", NUMBER_BITS_MAX, " bits");
         std::uint64_t number = 1;
         for (unsigned index = 0; index < bits; ++index) number = number << 1 | static_cast<std::uint64_t>(bit());
         return number - (std::uint64_t{1} << order);
@@ -99,69 +82,42 @@ public:
     // A cell of the payload's type from its number on the wire.
     std::int32_t cell(std::uint64_t number) const {
         const std::uint64_t most = type_ == CellType::U16 ? 0xffff : 0xff;
-        if (number > most) refuse("a cell has the number " + std::to_string(number) + "; at most " +
-                                  std::to_string(most) + " is allowed");
+        require(number <= most, "cells", "a cell has the number ", number, "; at most ", most, " is allowed");
         const auto value = static_cast<std::int32_t>(number);
         return type_ == CellType::I8 ? (value >> 1 ^ -(value & 1)) : value;
     }
 
     // Checks that nothing follows but zeros that fill the last byte.
     void finish() {
-        while (at_ % 8 != 0) {
-            if (bit()) refuse("a 1 follows the cells; zeros fill the last byte");
-        }
-        if (at_ / 8 != payload_.size()) {
-            refuse(std::to_string(payload_.size() - at_ / 8) + " bytes follow the cells; 0 are allowed");
-        }
+        while (at_ % 8 != 0) require(!bit(), "cells", "a 1 follows the cells; zeros fill the last byte");
+        require(at_ / 8 == payload_.size(), "cells", payload_.size() - at_ / 8, " bytes follow the cells; 0 may");
     }
 
 private:
-    std::string length() const { return std::to_string(payload_.size()); }
-
     Bytes payload_;
     CellType type_;
     std::size_t at_ = 0;
 };
 
-inline std::size_t checked_length(std::uint64_t length, std::size_t left) {
-    if (length > left) {
-        refuse("a length of " + std::to_string(length) + " cells; " + std::to_string(left) + " are left");
-    }
-    return static_cast<std::size_t>(length);
-}
-
-// Reads `ENCODING_ROWS`: copies of the row before and runs of one value, in turn. `copy` and `run` get the first cell
-// and the length; `run` also gets whether the value of the cell before repeats, and else the value.
-template <class Copy, class Run>
-void read_rows(Bits bits, std::size_t count, Copy copy, Run run) {
-    for (std::size_t at = 0; at < count;) {
-        const std::size_t copied = checked_length(bits.number(), count - at);
-        copy(at, copied);
-        at += copied;
-        if (at == count) break;
-        const bool repeats_before = bits.bit();
-        if (repeats_before && at == 0) refuse("the first cell is as the cell before it; there is none");
-        const std::int32_t value = repeats_before ? 0 : bits.cell(bits.number());
-        const std::size_t length = checked_length(bits.number() + 1, count - at);
-        run(at, length, repeats_before, value);
-        at += length;
+// Decodes `ENCODING_ROWS`: copies of the row before and runs of one value, in turn.
+inline Cells rows(Bits bits, std::size_t count, std::size_t columns) {
+    Cells cells;
+    const auto checked = [&](std::uint64_t length) {
+        const std::size_t left = count - cells.size();
+        require(length <= left, "cells", "a length of ", length, " cells; ", left, " are left");
+        return static_cast<std::size_t>(length);
+    };
+    while (cells.size() < count) {
+        for (std::size_t left = checked(bits.number()); left > 0; --left) {
+            cells.push_back(cells.size() < columns ? 0 : cells[cells.size() - columns]);
+        }
+        if (cells.size() == count) break;
+        const bool repeats = bits.bit();
+        require(!repeats || !cells.empty(), "cells", "the first cell is as the cell before it; there is none");
+        const std::int32_t value = repeats ? cells.back() : bits.cell(bits.number());
+        cells.insert(cells.end(), checked(bits.number() + 1), value);
     }
     bits.finish();
-}
-
-inline Cells rows(const Bits& bits, std::size_t count, std::size_t columns) {
-    // The lengths are checked before memory is allocated: a few bytes can claim millions of cells.
-    read_rows(bits, count, [](auto, auto) {}, [](auto, auto, auto, auto) {});
-    Cells cells(count);
-    read_rows(
-        bits, count,
-        [&](std::size_t at, std::size_t length) {
-            for (std::size_t end = at + length; at < end; ++at) cells[at] = at < columns ? 0 : cells[at - columns];
-        },
-        [&](std::size_t at, std::size_t length, bool repeats_before, std::int32_t value) {
-            std::fill_n(cells.begin() + static_cast<std::ptrdiff_t>(at), length,
-                        repeats_before ? cells[at - 1] : value);
-        });
     return cells;
 }
 
@@ -170,54 +126,44 @@ inline Cells changes(Bits bits, Cells cells, std::size_t columns) {
     struct Runs {
         std::uint64_t means[2] = {0, 0};
         std::uint64_t left = 0;
-        bool has_begun = false, flag = false;
+        std::optional<bool> flag;
     };
     std::array<Runs, 65> contexts{};
     const auto read_flag = [&](std::size_t context) {
         Runs& runs = contexts[context];
         if (runs.left == 0) {
-            runs.flag = runs.has_begun ? !runs.flag : bits.bit();
-            runs.has_begun = true;
-            runs.left = bits.adaptive(runs.means[runs.flag ? 1 : 0]) + 1;
+            runs.flag = runs.flag ? !*runs.flag : bits.bit();
+            runs.left = bits.adaptive(runs.means[*runs.flag ? 1 : 0]) + 1;
         }
         --runs.left;
-        return runs.flag;
+        return *runs.flag;
     };
+    const Cells base = cells;
     const std::size_t count = cells.size();
-    std::vector<std::uint8_t> context(count);
-    // Cells above, to the left, below and to the right, each with its bit.
-    const auto neighbours = [&](std::size_t at, auto visit) {
-        if (at >= columns) visit(at - columns, 4);
-        if (at % columns != 0) visit(at - 1, 8);
-        if (count - at > columns) visit(at + columns, 16);
-        if ((at + 1) % columns != 0 && at + 1 < count) visit(at + 1, 32);
-    };
-    for (std::size_t at = 0; at < count; ++at) {
-        neighbours(at, [&](std::size_t near, int bit) {
-            if (cells[near] != cells[at]) context[at] = static_cast<std::uint8_t>(context[at] | bit);
-        });
-    }
+    std::vector<bool> has_changed(count);
     std::uint64_t value_mean = 0;
     for (std::size_t at = 0; at < count; ++at) {
-        if (!read_flag(context[at])) continue;
-        if (count - at > columns) context[at + columns] |= 1;
-        if ((at + 1) % columns != 0 && at + 1 < count) context[at + 1] |= 2;
-        // The first of the cells left, above, right and below that differs from this one.
-        std::array<const std::int32_t*, 4> near{};
-        neighbours(at, [&](std::size_t index, int bit) {
-            near[bit == 8 ? 0 : bit == 4 ? 1 : bit == 32 ? 2 : 3] = &cells[index];
-        });
-        const auto predicted =
-            std::find_if(near.begin(), near.end(), [&](const auto* cell) { return cell && *cell != cells[at]; });
-        const bool is_predicted = predicted != near.end() && !read_flag(64);
-        cells[at] = is_predicted ? **predicted : bits.cell(bits.adaptive(value_mean));
+        // The cells to the left, above, to the right and below; `count` where there is none.
+        const std::size_t near[4] = {at % columns != 0 ? at - 1 : count, at >= columns ? at - columns : count,
+                                     (at + 1) % columns != 0 ? at + 1 : count,
+                                     count - at > columns ? at + columns : count};
+        constexpr std::size_t BITS[4] = {8, 4, 32, 16};
+        std::size_t context = 0;
+        for (int side = 0; side < 4; ++side) {
+            if (near[side] < count && base[near[side]] != base[at]) context |= BITS[side];
+        }
+        if (near[1] < count && has_changed[near[1]]) context |= 1;
+        if (near[0] < count && has_changed[near[0]]) context |= 2;
+        if (!read_flag(context)) continue;
+        has_changed[at] = true;
+        const auto differs = [&](std::size_t index) { return index < count && cells[index] != cells[at]; };
+        const std::size_t* const predicted = std::find_if(near, near + 4, differs);
+        const bool is_predicted = predicted != near + 4 && !read_flag(64);
+        cells[at] = is_predicted ? cells[*predicted] : bits.cell(bits.adaptive(value_mean));
     }
-    for (const Runs& runs : contexts) {
-        if (runs.left > 0) refuse("a run goes " + std::to_string(runs.left) + " flags beyond the last cell");
-    }
+    for (const Runs& runs : contexts) require(runs.left == 0, "cells", "a run has ", runs.left, " flags too many");
     bits.finish();
     return cells;
 }
 
-}  // namespace codec
-}  // namespace clearway
+}  // namespace clearway::codec

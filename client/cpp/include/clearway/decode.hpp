@@ -3,10 +3,12 @@
 
 #include <set>
 
+#include "cells.hpp"
 #include "map.hpp"
 
-namespace clearway {
-namespace decoding {
+namespace clearway::decoding {
+
+using namespace wire;
 
 // A channel as on the wire.
 struct RawChannel {
@@ -23,10 +25,9 @@ struct RawPoints {
     std::vector<std::uint32_t> starts, link_from, link_back;
 };
 
-// A layer as on the wire.
+// A layer as on the wire. Its grid has no cells if none was sent.
 struct RawLayer {
     Layer layer;
-    std::variant<std::monostate, RadialGrid, CartesianGrid> geometry;
     std::vector<std::string> names;
     std::vector<std::int32_t> meanings;
     std::vector<std::uint32_t> colours;
@@ -35,247 +36,135 @@ struct RawLayer {
     std::optional<std::uint64_t> base_sequence;
 };
 
-using wire::Fields;
-
 // Counts layers, channels, planes, sensors and names, up to the first byte that is not protobuf; stops above the limit.
-inline void count_parts(Bytes message, bool is_map, std::size_t& parts) {
-    try {
-        for (Fields fields(message); parts <= MAP_PARTS_MAX && fields.next();) {
-            if (!fields.has_content()) continue;
-            ++parts;
-            if (is_map && fields.tag() <= 2) count_parts(fields.content(), false, parts);
-        }
-    } catch (const Error&) {
-        // The decoder stops there too, and names the fault.
+inline void count_parts(Bytes message, bool is_map, std::size_t& parts) try {
+    for (Fields fields(message); parts <= MAP_PARTS_MAX && fields.next();) {
+        if (!fields.has_content()) continue;
+        ++parts;
+        if (is_map && fields.tag() <= 2) count_parts(fields.content(), false, parts);
     }
+} catch (const Error&) {
+    // The decoder stops there too, and names the fault.
 }
 
-inline void read_header(Bytes message, Header& header) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: header.vehicle = fields.text(); break;
-            case 2: header.boot_id = fields.fixed64(); break;
-            case 3: header.sequence = fields.varint(); break;
-            case 4: header.capture_start_ns = fields.sfixed64(); break;
-            case 5: header.capture_end_ns = fields.sfixed64(); break;
-            case 6: header.completed_ns = fields.sfixed64(); break;
-            case 7: header.valid_until_ns = fields.sfixed64(); break;
-            case 8: {
-                if (!header.map_from_ego) header.map_from_ego.emplace();
-                Pose& pose = *header.map_from_ego;
-                double* const values[] = {&pose.x, &pose.y, &pose.z, &pose.qx, &pose.qy, &pose.qz, &pose.qw};
-                for (Fields of(fields.content()); of.next();) {
-                    if (of.tag() <= 7) *values[of.tag() - 1] = of.f64();
-                }
-                break;
-            }
-            case 9: header.speed_mps = fields.f64(); break;
-            case 14: header.epoch = fields.u32(); break;
-            case 16: header.wire_version = fields.u32(); break;
-            default: break;
-        }
-    }
+inline void read_header(Bytes message, Header& h) {
+    const auto pose = [&](Bytes content) {
+        Pose& p = h.map_from_ego ? *h.map_from_ego : h.map_from_ego.emplace();
+        read(content, p.x, p.y, p.z, p.qx, p.qy, p.qz, p.qw);
+    };
+    const Unread other;
+    read(message, h.vehicle, fixed(h.boot_id), h.sequence, fixed(h.capture_start_ns), fixed(h.capture_end_ns),
+         fixed(h.completed_ns), fixed(h.valid_until_ns), pose, h.speed_mps, other, other, other, other, h.epoch, other,
+         h.wire_version);
 }
 
-inline void read_radial(Bytes message, RadialGrid& grid) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: fields.append(grid.row_radius_m, Fields::FIXED32, &Fields::f32); break;
-            case 2: grid.columns = fields.u32(); break;
-            case 3: grid.centre_x_m = fields.f32(); break;
-            case 4: grid.centre_y_m = fields.f32(); break;
-            default: break;
-        }
-    }
-}
-
-inline void read_cartesian(Bytes message, CartesianGrid& grid) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: grid.origin_x_m = fields.f64(); break;
-            case 2: grid.origin_y_m = fields.f64(); break;
-            case 3: grid.width = fields.u32(); break;
-            case 4: grid.height = fields.u32(); break;
-            case 5: grid.cell_m = fields.f32(); break;
-            case 6: grid.yaw_rad = fields.f64(); break;
-            case 7: grid.first_ix = fields.s64(); break;
-            case 8: grid.first_iy = fields.s64(); break;
-            default: break;
-        }
-    }
-}
-
-inline RawChannel read_channel(Bytes message) {
-    RawChannel raw;
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: raw.channel.name = fields.text(); break;
-            case 2: raw.channel.unit = fields.text(); break;
-            case 3: raw.channel.scale = fields.f32(); break;
-            case 4: raw.cell_type = fields.i32(); break;
-            case 5: raw.channel.unknown = fields.s32(); break;
-            case 6: raw.encoding = fields.i32(); break;
-            case 7: raw.cell_count = fields.u32(); break;
-            case 8: raw.crc32 = fields.fixed32(); break;
-            case 9: raw.payload = fields.content(); break;
-            case 10: raw.by_class = fields.content(); break;
-            default: break;
-        }
-    }
-    return raw;
-}
-
-inline void read_points(Bytes message, RawPoints& points) {
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: points.step_m = fields.f32(); break;
-            case 2: fields.append(points.x, Fields::VARINT, &Fields::s32); break;
-            case 3: fields.append(points.y, Fields::VARINT, &Fields::s32); break;
-            case 4: fields.append(points.radius_cm, Fields::VARINT, &Fields::s32); break;
-            case 5: fields.append(points.starts, Fields::VARINT, &Fields::u32); break;
-            case 6: fields.append(points.link_from, Fields::VARINT, &Fields::u32); break;
-            case 7: fields.append(points.link_back, Fields::VARINT, &Fields::u32); break;
-            default: break;
-        }
-    }
-}
-
-template <class Kind, class Variant>
-Kind& kept(Variant& geometry) {
-    return std::holds_alternative<Kind>(geometry) ? std::get<Kind>(geometry) : geometry.template emplace<Kind>();
+// The alternative of a `oneof`, as it is or made now.
+template <class Kind>
+Kind& kept(std::variant<RadialGrid, CartesianGrid>& grid) {
+    return std::holds_alternative<Kind>(grid) ? std::get<Kind>(grid) : grid.emplace<Kind>();
 }
 
 inline RawLayer read_layer(Bytes message) {
     RawLayer raw;
-    for (Fields fields(message); fields.next();) {
-        switch (fields.tag()) {
-            case 1: raw.layer.name = fields.text(); break;
-            case 2: read_radial(fields.content(), kept<RadialGrid>(raw.geometry)); break;
-            case 3: read_cartesian(fields.content(), kept<CartesianGrid>(raw.geometry)); break;
-            case 4: raw.names.push_back(fields.text()); break;
-            case 5: raw.channels.push_back(read_channel(fields.content())); break;
-            case 6: {
-                double values[3] = {0, 0, 0};
-                for (Fields of(fields.content()); of.next();) {
-                    if (of.tag() <= 3) values[of.tag() - 1] = of.f64();
-                }
-                raw.layer.planes.push_back({values[0], values[1], values[2]});
-                break;
-            }
-            case 7: {
-                std::pair<std::string, double> metric;
-                for (Fields of(fields.content()); of.next();) {
-                    if (of.tag() == 1) metric.first = of.text();
-                    if (of.tag() == 2) metric.second = of.f64();
-                }
-                raw.layer.metrics[metric.first] = metric.second;
-                break;
-            }
-            case 9:
-                if (!raw.points) raw.points.emplace();
-                read_points(fields.content(), *raw.points);
-                break;
-            case 10: raw.base_sequence = fields.varint(); break;
-            case 11: fields.append(raw.meanings, Fields::VARINT, &Fields::i32); break;
-            case 12: fields.append(raw.colours, Fields::FIXED32, &Fields::fixed32); break;
-            default: break;
-        }
-    }
+    const auto radial = [&](Bytes content) {
+        auto& grid = kept<RadialGrid>(raw.layer.grid);
+        read(content, grid.row_radius_m, grid.columns, grid.centre_x_m, grid.centre_y_m);
+    };
+    const auto cartesian = [&](Bytes content) {
+        auto& grid = kept<CartesianGrid>(raw.layer.grid);
+        read(content, grid.origin_x_m, grid.origin_y_m, grid.width, grid.height, grid.cell_m, grid.yaw_rad,
+             zigzag(grid.first_ix), zigzag(grid.first_iy));
+    };
+    const auto channel = [&](Bytes content) {
+        RawChannel& one = raw.channels.emplace_back();
+        Channel& as = one.channel;
+        read(content, as.name, as.unit, as.scale, one.cell_type, zigzag(as.unknown), one.encoding, one.cell_count,
+             fixed(one.crc32), one.payload, one.by_class);
+    };
+    const auto plane = [&](Bytes content) {
+        Plane& one = raw.layer.planes.emplace_back();
+        read(content, one.a, one.b, one.c);
+    };
+    const auto metric = [&](Bytes content) {
+        std::pair<std::string, double> one;
+        read(content, one.first, one.second);
+        raw.layer.metrics[one.first] = one.second;
+    };
+    const auto points = [&](Bytes content) {
+        RawPoints& of = raw.points ? *raw.points : raw.points.emplace();
+        read(content, of.step_m, zigzag(of.x), zigzag(of.y), zigzag(of.radius_cm), of.starts, of.link_from,
+             of.link_back);
+    };
+    read(message, raw.layer.name, radial, cartesian, raw.names, channel, plane, metric, Unread{}, points,
+         raw.base_sequence, raw.meanings, fixed(raw.colours));
     return raw;
 }
 
 inline void check_header(const Header& header) {
-    if (header.wire_version > WIRE_VERSION) {
-        throw Error("version", "wire of version " + std::to_string(header.wire_version) +
-                                   "; this reader knows versions up to " + std::to_string(WIRE_VERSION));
-    }
-    if (header.capture_start_ns > header.capture_end_ns) {
-        throw Error("header", "capture starts at " + std::to_string(header.capture_start_ns) +
-                                  " ns; that is after its end at " + std::to_string(header.capture_end_ns) + " ns");
-    }
+    require(header.wire_version <= WIRE_VERSION, "version", "wire of version ", header.wire_version,
+            "; this reader knows versions up to ", WIRE_VERSION);
+    require(header.capture_start_ns <= header.capture_end_ns, "header", "capture starts at ", header.capture_start_ns,
+            " ns; that is after its end at ", header.capture_end_ns, " ns");
     if (!header.map_from_ego) return;
     const Pose& p = *header.map_from_ego;
     const double norm = std::sqrt(p.qx * p.qx + p.qy * p.qy + p.qz * p.qz + p.qw * p.qw);
     const bool is_finite = std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z) && std::isfinite(norm);
-    if (!is_finite || std::abs(norm - 1.0) > 1e-3) {
-        throw Error("header", "map_from_ego has a quaternion of norm " + std::to_string(norm) +
-                                  "; finite metres and norm 1 are needed");
-    }
+    require(is_finite && std::abs(norm - 1.0) <= 1e-3, "header", "map_from_ego has a quaternion of norm ", norm,
+            "; finite metres and norm 1 are needed");
 }
 
-inline Grid checked_grid(const RawLayer& raw) {
-    const auto wrong = [&](const std::string& what) {
-        return Error("geometry", "layer '" + raw.layer.name + "': " + what);
-    };
-    if (const auto* grid = std::get_if<RadialGrid>(&raw.geometry)) {
+inline void check_grid(const Grid& grid) {
+    require(grid.cell_count() > 0, "geometry", "0 cells; a radial or Cartesian grid with at least 1 is needed");
+    if (const RadialGrid* rings = grid.radial()) {
         float inner = 0;
-        for (const float outer : grid->row_radius_m) {
-            if (!std::isfinite(outer) || outer <= inner) {
-                throw wrong("a radius of " + std::to_string(outer) + " m; finite, ascending radii are needed");
-            }
+        for (const float outer : rings->row_radius_m) {
+            const bool is_right = std::isfinite(outer) && outer > inner;
+            require(is_right, "geometry", "a radius of ", outer, " m; finite, ascending radii are needed");
             inner = outer;
         }
-        if (grid->columns == 0 || grid->row_radius_m.empty()) throw wrong("0 cells; at least 1 is needed");
-        if (!std::isfinite(grid->centre_x_m) || !std::isfinite(grid->centre_y_m)) throw wrong("a centre not finite");
-        return *grid;
+        const bool is_finite = std::isfinite(rings->centre_x_m) && std::isfinite(rings->centre_y_m);
+        return require(is_finite, "geometry", "a centre that is not finite");
     }
-    const auto* grid = std::get_if<CartesianGrid>(&raw.geometry);
-    if (!grid) throw wrong("no grid; radial or cartesian is needed");
-    if (grid->width == 0 || grid->height == 0) throw wrong("0 cells; at least 1 is needed");
-    if (!std::isfinite(grid->cell_m) || grid->cell_m <= 0) {
-        throw wrong("cells of " + std::to_string(grid->cell_m) + " m; a finite edge above 0 is needed");
-    }
-    if (!std::isfinite(grid->origin_x_m) || !std::isfinite(grid->origin_y_m) || !std::isfinite(grid->yaw_rad)) {
-        throw wrong("an origin or a yaw that is not finite");
-    }
-    return *grid;
+    const CartesianGrid& of = *grid.cartesian();
+    require(std::isfinite(of.cell_m) && of.cell_m > 0, "geometry", "cells of ", of.cell_m, " m; over 0 m are needed");
+    const bool is_finite = std::isfinite(of.origin_x_m) && std::isfinite(of.origin_y_m) && std::isfinite(of.yaw_rad);
+    require(is_finite, "geometry", "an origin or a yaw that is not finite");
 }
 
-// Rows and columns from the cells of a grid to the cells of its base layer at the same places; none if they share none.
+// Rows and columns from the cells of a grid to the cells of its base layer at the same places. Grids that are farther
+// apart than this share no cell.
 struct Shift {
-    std::optional<std::int64_t> rows = 0, columns = 0;
+    static constexpr std::int64_t FAR = std::int64_t{1} << 32;
+    std::int64_t rows = 0, columns = 0;
 };
 
-inline Shift shift_of(const Layer& base, const Layer& layer) {
-    const auto wrong = [&] {
-        return Error("base_shape", "layer '" + layer.name + "' is a delta to a grid that is not comparable");
+inline Shift shift_of(const Grid& base, const Grid& grid) {
+    const RadialGrid *before = base.radial(), *now = grid.radial();
+    const CartesianGrid *squares = base.cartesian(), *moved = grid.cartesian();
+    const bool is_same = before && now ? *before == *now : squares && moved && squares->cell_m == moved->cell_m;
+    require(is_same, "base_shape", "a delta to a grid that is not comparable");
+    if (now) return {};
+    const auto steps = [](std::int64_t to, std::int64_t from) {
+        const double far = static_cast<double>(to) - static_cast<double>(from);
+        return std::abs(far) < static_cast<double>(Shift::FAR) ? to - from : far < 0 ? -Shift::FAR : Shift::FAR;
     };
-    if (const RadialGrid *before = base.grid.radial(), *now = layer.grid.radial(); before && now) {
-        const bool is_same = before->row_radius_m == now->row_radius_m && before->columns == now->columns &&
-                             before->centre_x_m == now->centre_x_m && before->centre_y_m == now->centre_y_m;
-        if (!is_same) throw wrong();
-        return {};
-    }
-    const CartesianGrid *before = base.grid.cartesian(), *now = layer.grid.cartesian();
-    if (!before || !now || before->cell_m != now->cell_m) throw wrong();
-    const auto steps = [](std::int64_t to, std::int64_t from) -> std::optional<std::int64_t> {
-        // The difference of any two numbers fits in 64 bits without its sign.
-        const auto far = to >= from ? static_cast<std::uint64_t>(to) - static_cast<std::uint64_t>(from)
-                                    : static_cast<std::uint64_t>(from) - static_cast<std::uint64_t>(to);
-        if (far > UINT32_MAX) return std::nullopt;
-        return to >= from ? static_cast<std::int64_t>(far) : -static_cast<std::int64_t>(far);
-    };
-    return {steps(now->first_iy, before->first_iy), steps(now->first_ix, before->first_ix)};
+    return {steps(moved->first_iy, squares->first_iy), steps(moved->first_ix, squares->first_ix)};
 }
 
 // The base of a delta's channel: the base layer's cells at the places of the grid, `unknown` where it has none.
 inline Cells shifted(const RawChannel& raw, const Layer& base, const Layer& layer, const Shift& by) {
     const Channel* before = base.channel(raw.channel.name);
-    if (!before || static_cast<std::int32_t>(before->type) != raw.cell_type) {
-        throw Error("base_shape", "layer '" + layer.name + "': the base has no channel '" + raw.channel.name +
-                                      "' of cell type " + std::to_string(raw.cell_type));
-    }
-    const auto unknown = codec::wrapped(before->type, static_cast<std::uint32_t>(raw.channel.unknown));
-    Cells cells(raw.cell_count, unknown);
-    if (!by.rows || !by.columns) return cells;
-    const auto signed_size = [](std::size_t size) { return static_cast<std::int64_t>(size); };
-    const auto rows = signed_size(layer.grid.rows()), columns = signed_size(layer.grid.columns());
-    const auto from_rows = signed_size(base.grid.rows()), from_columns = signed_size(base.grid.columns());
-    const auto first = std::max<std::int64_t>(0, -*by.columns), last = std::min(columns, from_columns - *by.columns);
-    for (std::int64_t row = 0; row < rows && first < last; ++row) {
-        const std::int64_t from = row + *by.rows;
+    require(before && static_cast<std::int32_t>(before->type) == raw.cell_type, "base_shape",
+            "the base has no channel '", raw.channel.name, "' of cell type ", raw.cell_type);
+    Cells cells(raw.cell_count, codec::wrapped(before->type, static_cast<std::uint32_t>(raw.channel.unknown)));
+    const auto columns = static_cast<std::int64_t>(layer.grid.columns());
+    const auto from_rows = static_cast<std::int64_t>(base.grid.rows());
+    const auto from_columns = static_cast<std::int64_t>(base.grid.columns());
+    const auto first = std::max<std::int64_t>(0, -by.columns), last = std::min(columns, from_columns - by.columns);
+    for (std::int64_t row = 0; row * columns < raw.cell_count && first < last; ++row) {
+        const std::int64_t from = row + by.rows;
         if (from < 0 || from >= from_rows) continue;
-        std::copy_n(before->cells.begin() + from * from_columns + first + *by.columns, last - first,
+        std::copy_n(before->cells.begin() + from * from_columns + first + by.columns, last - first,
                     cells.begin() + row * columns + first);
     }
     return cells;
@@ -286,52 +175,185 @@ inline Cells looked_up(const RawChannel& raw, const Layer& layer) {
     const auto type = raw.cell_type == 2 || raw.cell_type == 3 ? static_cast<CellType>(raw.cell_type) : CellType::U8;
     const Channel* classes = layer.channel("class");
     const std::size_t known = layer.legend.size();
-    const bool fits = classes && classes->type == CellType::U8 && raw.encoding == codec::CHANGES &&
-                      raw.by_class.size() == known * codec::bytes_of(type);
     const auto has_name = [&](std::int32_t cell) { return static_cast<std::size_t>(cell) < known; };
-    if (!fits || !std::all_of(classes->cells.begin(), classes->cells.end(), has_name)) {
-        throw Error("by_class", "channel '" + raw.channel.name + "' has a class table of " +
-                                    std::to_string(raw.by_class.size()) + " bytes; changes, one raw cell for each of " +
-                                    std::to_string(known) + " classes, and their channel before it are needed");
-    }
+    const bool fits = classes && classes->type == CellType::U8 && raw.encoding == codec::CHANGES &&
+                      raw.by_class.size() == known * codec::bytes_of(type) &&
+                      std::all_of(classes->cells.begin(), classes->cells.end(), has_name);
+    require(fits, "by_class", "channel '", raw.channel.name, "' has a class table of ", raw.by_class.size(),
+            " bytes; changes, one raw cell for each of ", known, " classes, and their channel before it are needed");
     const Cells table = codec::raw(raw.by_class, type);
-    Cells cells(classes->cells.size());
-    const auto look_up = [&](std::int32_t cell) { return table[static_cast<std::size_t>(cell)]; };
-    std::transform(classes->cells.begin(), classes->cells.end(), cells.begin(), look_up);
+    Cells cells;
+    for (const std::int32_t cell : classes->cells) cells.push_back(table[static_cast<std::size_t>(cell)]);
     return cells;
 }
 
 // Decodes the cells of a channel. `base`: as many cells of the same type, for changes.
 inline Cells decode_cells(const RawChannel& raw, std::size_t columns, std::optional<Cells> base) {
-    if (raw.cell_type < 1 || raw.cell_type > 3) codec::refuse("cell type " + std::to_string(raw.cell_type));
+    require(raw.cell_count <= CHANNEL_CELLS_MAX, "too_many_cells", raw.cell_count, " cells; at most ",
+            CHANNEL_CELLS_MAX, " are allowed");
+    require(raw.cell_type >= 1 && raw.cell_type <= 3, "cells", "cell type ", raw.cell_type, "; 1 to 3 are known");
     const auto type = static_cast<CellType>(raw.cell_type);
     const std::size_t length = raw.payload.size(), whole = raw.cell_count * codec::bytes_of(type);
-    const bool fits = raw.encoding == codec::RAW       ? length == whole
-                      : raw.encoding == codec::ROWS    ? length < whole
-                      : raw.encoding == codec::CHANGES ? length < whole && base
-                                                       : false;
-    if (!fits) {
-        codec::refuse(std::to_string(length) + " bytes of encoding " + std::to_string(raw.encoding) + " for " +
-                      std::to_string(raw.cell_count) + " cells" + (base ? "" : " without a base"));
-    }
     const codec::Bits bits(raw.payload, type);
-    const Cells cells = raw.encoding == codec::RAW    ? codec::raw(raw.payload, type)
-                        : raw.encoding == codec::ROWS ? codec::rows(bits, raw.cell_count, columns)
-                                                      : codec::changes(bits, std::move(*base), columns);
-    if (const auto computed = codec::crc32(cells, type); computed != raw.crc32) {
-        codec::refuse("CRC-32 of the cells is " + std::to_string(computed) + "; the channel states " +
-                      std::to_string(raw.crc32));
+    Cells cells;
+    if (raw.encoding == codec::RAW && length == whole) {
+        cells = codec::raw(raw.payload, type);
+    } else if (raw.encoding == codec::ROWS && length < whole) {
+        cells = codec::rows(bits, raw.cell_count, columns);
+    } else if (raw.encoding == codec::CHANGES && length < whole && base) {
+        cells = codec::changes(bits, std::move(*base), columns);
+    } else {
+        fail("cells", length, " bytes of encoding ", raw.encoding, " for ", whole, " bytes", base ? "" : ", no base");
     }
+    const std::uint32_t computed = codec::crc32(cells, type);
+    require(computed == raw.crc32, "cells", "CRC-32 of the cells is ", computed, "; the channel states ", raw.crc32);
     return cells;
 }
 
-inline void check_count(const RawChannel& raw) {
-    if (raw.cell_count <= CHANNEL_CELLS_MAX) return;
-    throw Error("too_many_cells", std::to_string(raw.cell_count) + " cells; at most " +
-                                      std::to_string(CHANNEL_CELLS_MAX) + " are allowed");
+inline std::vector<Class> legend_of(const RawLayer& raw) {
+    const std::size_t count = raw.names.size();
+    require(raw.meanings.size() == count && raw.colours.size() == count, "legend", count, " names, ",
+            raw.meanings.size(), " meanings, ", raw.colours.size(), " colours; equal numbers are needed");
+    require(count == 0 || raw.meanings[0] == 0, "legend", "class 0 does not have the meaning 0 (unknown)");
+    std::vector<Class> legend;
+    for (std::size_t at = 0; at < count; ++at) {
+        require(raw.colours[at] <= RGB_MAX, "legend", "a colour of ", raw.colours[at], "; at most ", RGB_MAX);
+        // A vehicle does not enter cells of a meaning that this version does not know.
+        const bool is_known = raw.meanings[at] >= 0 && raw.meanings[at] <= static_cast<std::int32_t>(Meaning::LOW);
+        legend.push_back({raw.names[at], is_known ? static_cast<Meaning>(raw.meanings[at]) : Meaning::UNKNOWN,
+                          raw.colours[at]});
+    }
+    return legend;
 }
 
-}  // namespace decoding
-}  // namespace clearway
+inline std::vector<SafePoint> points_of(const RawPoints& raw) {
+    const auto check = [](bool is_met, std::uint64_t point, const auto&... what) {
+        require(is_met, "safe_point", "safe point ", point, ": ", what...);
+    };
+    const std::size_t count = raw.x.size();
+    check(raw.y.size() == count && raw.radius_cm.size() == count && count <= MAP_PARTS_MAX, 0, count,
+          " values; as many of each, at most ", MAP_PARTS_MAX, ", are allowed");
+    check(std::isfinite(raw.step_m) && raw.step_m > 0, 0, "steps of ", raw.step_m, " m; finite ones over 0 are needed");
+    std::vector<SafePoint> points;
+    std::int64_t sums[3] = {0, 0, 0};
+    for (std::size_t at = 0; at < count; ++at) {
+        const std::int64_t differences[3] = {raw.x[at], raw.y[at], raw.radius_cm[at]};
+        for (int axis = 0; axis < 3; ++axis) {
+            sums[axis] += differences[axis];
+            check(std::abs(sums[axis]) <= SAFE_POINT_STEPS_MAX && (axis < 2 || sums[axis] >= 0), at, sums[axis],
+                  " steps or cm; to ", SAFE_POINT_STEPS_MAX, " and a radius of 0 or more are allowed");
+        }
+        points.push_back({static_cast<float>(sums[0]) * raw.step_m, static_cast<float>(sums[1]) * raw.step_m,
+                          static_cast<float>(sums[2]) / 100.0f, {}});
+        if (at > 0) points.back().links.push_back(static_cast<std::uint32_t>(at - 1));
+    }
+    std::uint64_t start = 0;
+    for (const std::uint32_t ahead : raw.starts) {
+        start += ahead;
+        check(ahead > 0 && start < count, start, "starts a line; ascending points are needed");
+        points[start].links.clear();
+    }
+    check(raw.link_from.size() == raw.link_back.size(), 0, "links from ", raw.link_from.size(), " points to ",
+          raw.link_back.size());
+    std::uint64_t from = 0;
+    std::uint64_t before = 0;
+    for (std::size_t at = 0; at < raw.link_from.size(); ++at) {
+        from += raw.link_from[at];
+        const std::uint32_t back = raw.link_back[at];
+        check(from < count && back >= 2 && back <= from, from, "a link ", back, " points back; 2 to it are allowed");
+        const auto to = static_cast<std::uint32_t>(from - back);
+        // Points have at most 32 bits; no link is 0, because none starts at the first point.
+        const std::uint64_t link = from << 32 | to;
+        check(before < link, from, "a link to ", to, " is not ascending");
+        before = link;
+        // The link to the point before stays last.
+        std::vector<std::uint32_t>& links = points[from].links;
+        links.insert(std::lower_bound(links.begin(), links.end(), to), to);
+    }
+    return points;
+}
 
-#include "layers.hpp"
+// Checks that the legend has an entry for the class of every cell.
+inline void check_classes(const Layer& layer) {
+    const Channel* classes = layer.channel("class");
+    if (!classes) return;
+    const bool begins = !layer.legend.empty() && layer.legend[0].name == "unknown";
+    require(begins, "legend", "class 0 is 'unknown' in every legend");
+    for (const std::int32_t cell : classes->cells) {
+        const bool is_named = cell >= 0 && static_cast<std::size_t>(cell) < layer.legend.size();
+        require(is_named, "class", "class ", cell, " has no name among ", layer.legend.size());
+    }
+}
+
+// Decodes one layer. `base`: its base layer if it is a delta.
+inline void decode_layer(RawLayer& raw, const Layer* base) {
+    Layer& layer = raw.layer;
+    check_grid(layer.grid);
+    std::set<std::string_view> names;
+    for (const RawChannel& one : raw.channels) {
+        require(names.insert(one.channel.name).second, "twice", "channel '", one.channel.name, "' occurs twice");
+    }
+    const Shift shift = base ? shift_of(base->grid, layer.grid) : Shift{};
+    const bool has_legend = !raw.names.empty() || !raw.meanings.empty() || !raw.colours.empty();
+    layer.legend = base && !has_legend ? base->legend : legend_of(raw);
+    for (RawChannel& one : raw.channels) {
+        require(one.cell_count == layer.grid.cell_count(), "cell_count", "channel '", one.channel.name, "' has ",
+                one.cell_count, " cells; the grid has ", layer.grid.cell_count());
+        std::optional<Cells> from;
+        if (!one.by_class.empty()) from = looked_up(one, layer);
+        else if (base && one.encoding == codec::CHANGES) from = shifted(one, *base, layer, shift);
+        one.channel.cells = decode_cells(one, layer.grid.columns(), std::move(from));
+        one.channel.type = static_cast<CellType>(one.cell_type);
+        layer.channels.push_back(std::move(one.channel));
+    }
+    if (raw.points) layer.points = points_of(*raw.points);
+    check_classes(layer);
+}
+
+// The base layer of a delta; null for a whole layer.
+inline const Layer* base_of(const RawLayer& raw, const Header& header, const Map* base) {
+    if (!raw.base_sequence) return nullptr;
+    const Layer* found = base ? base->find(raw.layer.name) : nullptr;
+    const bool is_it = base && base->header.vehicle == header.vehicle && base->header.boot_id == header.boot_id &&
+                       base->header.sequence == *raw.base_sequence;
+    require(!base || is_it, "other_base", "a delta to map ", *raw.base_sequence, " of '", header.vehicle,
+            "'; another one was given");
+    require(found, "no_base", "a delta to the layer of map ", *raw.base_sequence);
+    return found;
+}
+
+}  // namespace clearway::decoding
+
+inline clearway::Map clearway::Map::decode(Bytes bytes, const Map* base) {
+    using namespace decoding;
+    require(bytes.size() <= MAP_BYTES_MAX, "too_long", "map of ", bytes.size(), " bytes; at most ", MAP_BYTES_MAX,
+            " are allowed");
+    std::size_t parts = 0;
+    count_parts(bytes, true, parts);
+    require(parts <= MAP_PARTS_MAX, "too_many_parts", "over ", MAP_PARTS_MAX, " layers, channels, sensors and names");
+    Map map;
+    bool has_header = false;
+    std::vector<RawLayer> layers;
+    const auto header = [&](Bytes content) { has_header = true, read_header(content, map.header); };
+    const auto layer = [&](Bytes content) { layers.push_back(read_layer(content)); };
+    read(bytes, header, layer);
+    require(has_header, "header", "the header is absent; every map has one");
+    check_header(map.header);
+    std::set<std::string_view> names;
+    std::uint64_t cells = 0;
+    for (const RawLayer& raw : layers) {
+        require(names.insert(raw.layer.name).second, "twice", "layer '", raw.layer.name, "' occurs twice");
+        for (const RawChannel& channel : raw.channels) cells += channel.cell_count;
+    }
+    require(cells <= MAP_CELLS_MAX, "too_many_cells", "the channels claim ", cells, " cells; at most ", MAP_CELLS_MAX,
+            " are allowed");
+    for (RawLayer& raw : layers) {
+        try {
+            decode_layer(raw, base_of(raw, map.header, base));
+        } catch (const Error& error) {
+            fail(error.reason(), "layer '", raw.layer.name, "': ", error.what());
+        }
+        map.layers.push_back(std::move(raw.layer));
+    }
+    return map;
+}

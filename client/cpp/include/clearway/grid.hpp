@@ -26,6 +26,10 @@ struct RadialGrid {
     std::uint32_t columns = 0;
     float centre_x_m = 0, centre_y_m = 0;
 
+    bool operator==(const RadialGrid& other) const {
+        return row_radius_m == other.row_radius_m && columns == other.columns && centre_x_m == other.centre_x_m &&
+               centre_y_m == other.centre_y_m;
+    }
     double inner_m(std::size_t row) const { return row == 0 ? 0.0 : static_cast<double>(row_radius_m[row - 1]); }
     double outer_m(std::size_t row) const { return static_cast<double>(row_radius_m[row]); }
     // The row at a distance from the centre; the number of rows beyond the last.

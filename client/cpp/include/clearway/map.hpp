@@ -8,10 +8,15 @@
 #include <map>
 #include <memory>
 
-#include "cells.hpp"
 #include "grid.hpp"
 
 namespace clearway {
+
+// Type of a raw cell, as on the wire.
+enum class CellType : std::int32_t { U8 = 1, I8 = 2, U16 = 3 };
+
+// Raw values in the order of the cell index, whatever their type.
+using Cells = std::vector<std::int32_t>;
 
 // What a class means to a planner; `ClassMeaning` of map.proto defines each of them. FREE alone may be entered.
 enum class Meaning : std::int32_t { UNKNOWN, FREE, INFERRED, OCCUPIED, HIDDEN, NOT_REACHED, LOW };
@@ -139,7 +144,7 @@ public:
         if (const Layer* found = find(name)) return *found;
         std::string present;
         for (const Layer& layer : layers) present += (present.empty() ? "" : ", ") + layer.name;
-        throw Error("layer", "no layer '" + std::string(name) + "'; this map has " + present);
+        fail("layer", "no layer '", name, "'; this map has ", present);
     }
 
     // Sets the time at which the map came from a server. Call it once, when its bytes arrive.

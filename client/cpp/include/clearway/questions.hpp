@@ -198,7 +198,7 @@ inline std::optional<Obstacle> nearest_low(const Layer& layer, Point to, const O
 inline std::vector<double> clearance(const Layer& layer, double most_m = 10.0, bool passes_low = false) {
     shapes::check_length("most_m", most_m);
     const CartesianGrid* grid = layer.grid.cartesian();
-    if (!grid) throw Error("no_squares", "layer '" + layer.name + "' has a radial grid; squares are needed");
+    require(grid, "no_squares", "layer '", layer.name, "' has a radial grid; squares are needed");
     const std::size_t width = grid->width, height = grid->height;
     const std::size_t reach = touching::limited(std::ceil(most_m / grid->edge_m() + 0.5), width + height);
     // Cells up or down the column to the nearest one that is not free, at most `reach`.

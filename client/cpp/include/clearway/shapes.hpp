@@ -33,17 +33,13 @@ inline constexpr double PATH_M_MAX = 1000.0;
 inline constexpr double STEP_M = 0.1;
 
 inline void check_finite(const std::string& what, double value) {
-    if (!std::isfinite(value)) {
-        throw Error("not_finite", what + " is " + std::to_string(value) + "; a finite number is needed");
-    }
+    require(std::isfinite(value), "not_finite", what, " is ", value, "; a finite number is needed");
 }
 
 inline void check_length(const std::string& what, double value, double most = HUGE_VAL) {
     check_finite(what, value);
-    if (value < 0 || value > most) {
-        const std::string allowed = most == HUGE_VAL ? "0 or more" : "0 to 1000";
-        throw Error("length", what + " is " + std::to_string(value) + " m; " + allowed + " m is allowed");
-    }
+    const char* const allowed = most == HUGE_VAL ? "0 or more" : "0 to 1000";
+    require(value >= 0 && value <= most, "length", what, " is ", value, " m; ", allowed, " m is allowed");
 }
 
 // One pose of a path.
@@ -65,10 +61,8 @@ inline std::vector<Point> distinct(const std::vector<Point>& given, bool is_poly
     }
     if (is_polygon && places.size() > 1 && places.front() == places.back()) places.pop_back();
     const std::size_t least = is_polygon ? 3 : 2;
-    if (places.size() < least || places.size() > CORNERS_MAX) {
-        throw Error("places", std::string(is_polygon ? "polygon" : "path") + " has " + std::to_string(places.size()) +
-                                  " different places; " + std::to_string(least) + " to 1000 are needed");
-    }
+    require(places.size() >= least && places.size() <= CORNERS_MAX, "places", is_polygon ? "polygon" : "path", " has ",
+            places.size(), " different places; ", least, " to 1000 are needed");
     return places;
 }
 
@@ -89,9 +83,8 @@ inline Polygon corners_of(const Polygon& polygon) {
             char near[80];
             std::snprintf(near, sizeof near, "(%.3f, %.3f)", c.x_m + share * (d.x_m - c.x_m),
                           c.y_m + share * (d.y_m - c.y_m));
-            throw Error("crossing", "edges " + std::to_string(one) + " and " + std::to_string(other) +
-                                        " of the polygon cross near " + near +
-                                        " m; a polygon that does not cross itself is needed");
+            fail("crossing", "edges ", one, " and ", other, " of the polygon cross near ", near,
+                 " m; a polygon that does not cross itself is needed");
         }
     }
     return corners;

@@ -3,30 +3,19 @@
 // In: bytes from any source. Out: fields in their order, or an `Error` with the value that was refused.
 #pragma once
 
-#include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <limits>
-#include <stdexcept>
-#include <string>
+#include <optional>
 #include <string_view>
-#include <utility>
+#include <type_traits>
 #include <vector>
+
+#include "error.hpp"
 
 namespace clearway {
 
 // Bytes of a message or a payload. They are not copied.
 using Bytes = std::string_view;
-
-// What is wrong with a map, a shape or a question. `reason` is the short name that all client languages share.
-class Error : public std::runtime_error {
-public:
-    Error(std::string reason, const std::string& message) : std::runtime_error(message), reason_(std::move(reason)) {}
-    const std::string& reason() const { return reason_; }
-
-private:
-    std::string reason_;
-};
 
 inline constexpr std::uint32_t CHANNEL_CELLS_MAX = 4u << 20;
 inline constexpr std::uint64_t MAP_CELLS_MAX = 16u << 20;
@@ -40,8 +29,9 @@ inline constexpr std::uint32_t WIRE_VERSION = 1;
 
 namespace wire {
 
-[[noreturn]] inline void refuse(const std::string& what) {
-    throw Error("protobuf", "not an encoded clearway.v1.Map: " + what);
+template <class... Parts>
+[[noreturn]] void refuse(const Parts&... parts) {
+    fail("protobuf", "not an encoded clearway.v1 message: ", parts...);
 }
 
 // True if the bytes are UTF-8: no overlong form, no surrogate, nothing above U+10FFFF.
@@ -61,6 +51,20 @@ inline bool is_utf8(Bytes text) {
     return true;
 }
 
+// How an integer travels: as a varint, as a varint that alternates between the signs, or in 4 or 8 bytes.
+enum class Form { PLAIN, ZIGZAG, FIXED };
+
+// A target of `read` whose type does not say how its numbers travel.
+template <Form form, class Target>
+struct As {
+    Target& target;
+};
+template <class Target> As<Form::ZIGZAG, Target> zigzag(Target& target) { return {target}; }
+template <class Target> As<Form::FIXED, Target> fixed(Target& target) { return {target}; }
+
+// A field that is passed over.
+struct Unread {};
+
 // The fields of one message, in their order.
 class Fields {
 public:
@@ -70,91 +74,75 @@ public:
 
     // Goes to the next field; false at the end of the message.
     bool next() {
-        if (at_ == bytes_.size()) return false;
-        const std::uint64_t key = read_varint();
+        if (is_at_end()) return false;
+        const std::uint64_t key = varint();
         tag_ = static_cast<std::uint32_t>(key >> 3);
         type_ = static_cast<std::uint32_t>(key & 7);
-        if (key > UINT32_MAX || tag_ == 0) refuse("a field with the key " + std::to_string(key));
+        if (key > UINT32_MAX || tag_ == 0) refuse("a field with the key ", key);
+        if (type_ == LENGTH) return content_ = take(varint()), true;
+        const std::size_t start = at_;
         if (type_ == VARINT) {
-            number_ = read_varint();
-        } else if (type_ == FIXED64) {
-            number_ = read_fixed(8);
-        } else if (type_ == FIXED32) {
-            number_ = read_fixed(4);
-        } else if (type_ == LENGTH) {
-            content_ = take(read_varint());
+            varint();
+        } else if (type_ == FIXED64 || type_ == FIXED32) {
+            take(type_ == FIXED64 ? 8 : 4);
         } else {
-            refuse("field " + std::to_string(tag_) + " has the wire type " + std::to_string(type_) +
-                   "; 0, 1, 2 and 5 are read");
+            refuse("field ", tag_, " has the wire type ", type_, "; 0, 1, 2 and 5 are read");
         }
+        content_ = bytes_.substr(start, at_ - start);
         return true;
     }
 
     std::uint32_t tag() const { return tag_; }
     bool has_content() const { return type_ == LENGTH; }
-
     Bytes content() const { return expect(LENGTH), content_; }
-    std::string text() const {
-        if (!is_utf8(content())) refuse("field " + std::to_string(tag_) + " is no UTF-8 text");
-        return std::string(content_);
-    }
-    std::uint64_t varint() const { return expect(VARINT), number_; }
-    std::uint32_t u32() const { return static_cast<std::uint32_t>(varint()); }
-    std::int32_t i32() const { return signed_of(u32()); }
-    std::int32_t s32() const { return zigzag(u32()); }
-    std::int64_t s64() const { return from_bits<std::int64_t>((varint() >> 1) ^ (0 - (varint() & 1))); }
-    std::uint64_t fixed64() const { return expect(FIXED64), number_; }
-    std::int64_t sfixed64() const { return from_bits<std::int64_t>(fixed64()); }
-    std::uint32_t fixed32() const { return expect(FIXED32), static_cast<std::uint32_t>(number_); }
-    double f64() const { return from_bits<double>(fixed64()); }
-    float f32() const { return from_bits<float>(fixed32()); }
 
-    // The numbers of a repeated field, packed or not, appended to a list. `read` is the method for one of them.
-    template <class Number, class Read>
-    void append(std::vector<Number>& list, Type type, Read read) const {
-        if (!has_content()) return list.push_back((this->*read)());
-        for (Fields packed(content_); packed.at_ < packed.bytes_.size();) {
-            packed.tag_ = tag_;
-            packed.type_ = type;
-            packed.number_ = type == VARINT ? packed.read_varint() : packed.read_fixed(type == FIXED32 ? 4 : 8);
-            list.push_back((packed.*read)());
+    // Puts the field into a number, a text, bytes, a list, or a function that reads the content.
+    template <Form form = Form::PLAIN, class Target>
+    void into(Target&& target) const {
+        if constexpr (std::is_invocable_v<Target, Bytes>) {
+            target(content());
+        } else {
+            using Number = std::decay_t<Target>;
+            expect(type_of<form, Number>());
+            target = Fields(content_).number<form, Number>();
         }
     }
+    void into(std::string& text) const {
+        if (!is_utf8(content())) refuse("field ", tag_, " is no UTF-8 text");
+        text = content_;
+    }
+    void into(Bytes& bytes) const { bytes = content(); }
+    void into(Unread) const {}
+    template <class Number> void into(std::optional<Number>& number) const { into(number.emplace()); }
+    void into(std::vector<std::string>& texts) const { into(texts.emplace_back()); }
+    // The numbers of a repeated field, packed or not.
+    template <Form form = Form::PLAIN, class Number>
+    void into(std::vector<Number>& list) const {
+        if (!has_content()) expect(type_of<form, Number>());
+        for (Fields numbers(content_); !numbers.is_at_end();) list.push_back(numbers.number<form, Number>());
+    }
+    template <Form form, class Target> void into(As<form, Target> as) const { into<form>(as.target); }
 
 private:
-    static std::int32_t signed_of(std::uint32_t bits) { return from_bits<std::int32_t>(bits); }
-    static std::int32_t zigzag(std::uint32_t bits) { return signed_of((bits >> 1) ^ (0 - (bits & 1))); }
-
-    template <class To, class From>
-    static To from_bits(From bits) {
-        static_assert(sizeof(To) == sizeof(From));
-        To value;
-        std::memcpy(&value, &bits, sizeof value);
-        return value;
+    template <Form form, class Number>
+    static constexpr Type type_of() {
+        if (form != Form::FIXED && !std::is_floating_point_v<Number>) return VARINT;
+        return sizeof(Number) == 8 ? FIXED64 : FIXED32;
     }
 
+    bool is_at_end() const { return at_ == bytes_.size(); }
+
     void expect(Type type) const {
-        if (type_ == type) return;
-        refuse("field " + std::to_string(tag_) + " has the wire type " + std::to_string(type_) + "; " +
-               std::to_string(type) + " is needed");
+        if (type_ != type) refuse("field ", tag_, " has the wire type ", type_, "; ", type, " is needed");
     }
 
     Bytes take(std::uint64_t length) {
         const std::size_t left = bytes_.size() - at_;
-        if (length > left) refuse(std::to_string(length) + " bytes claimed, " + std::to_string(left) + " left");
-        const Bytes taken = bytes_.substr(at_, static_cast<std::size_t>(length));
-        at_ += taken.size();
-        return taken;
+        if (length > left) refuse(length, " bytes claimed, ", left, " left");
+        return bytes_.substr(std::exchange(at_, at_ + static_cast<std::size_t>(length)), length);
     }
 
-    std::uint64_t read_fixed(unsigned bytes) {
-        const Bytes taken = take(bytes);
-        std::uint64_t number = 0;
-        for (unsigned index = bytes; index-- > 0;) number = number << 8 | static_cast<unsigned char>(taken[index]);
-        return number;
-    }
-
-    std::uint64_t read_varint() {
+    std::uint64_t varint() {
         std::uint64_t number = 0;
         for (unsigned shift = 0; shift < 70; shift += 7) {
             const auto byte = static_cast<unsigned char>(take(1)[0]);
@@ -165,12 +153,34 @@ private:
         refuse("a number of more than 64 bits");
     }
 
-    Bytes bytes_;
+    template <Form form, class Number>
+    Number number() {
+        using Bits = std::conditional_t<sizeof(Number) == 8, std::uint64_t, std::uint32_t>;
+        constexpr bool is_varint = type_of<form, Number>() == VARINT;
+        auto bits = is_varint ? static_cast<Bits>(varint()) : Bits{0};
+        for (unsigned shift = 0; !is_varint && shift < 8 * sizeof bits; shift += 8) {
+            bits |= static_cast<Bits>(static_cast<unsigned char>(take(1)[0])) << shift;
+        }
+        if (form == Form::ZIGZAG) bits = bits >> 1 ^ (0 - (bits & 1));
+        Number value;
+        static_assert(sizeof value == sizeof bits);
+        std::memcpy(&value, &bits, sizeof value);
+        return value;
+    }
+
+    Bytes bytes_, content_;
     std::size_t at_ = 0;
     std::uint32_t tag_ = 0, type_ = 0;
-    std::uint64_t number_ = 0;
-    Bytes content_;
 };
+
+// Reads a message: its field 1 into the first target, its field 2 into the second, and so on.
+template <class... Targets>
+void read(Bytes message, Targets&&... targets) {
+    for (Fields fields(message); fields.next();) {
+        std::uint32_t tag = 0;
+        ((++tag == fields.tag() ? fields.into(targets) : void()), ...);
+    }
+}
 
 }  // namespace wire
 }  // namespace clearway

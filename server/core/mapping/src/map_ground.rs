@@ -62,7 +62,7 @@ impl MapGround {
                 Some(memory) => {
                     memory.extend(sweep, scan.map_from_ego.as_ref(), scan.end_ns);
                     ground.estimate(memory.extended(sweep));
-                    memory.remember(sweep.x.len(), ground.heights_m());
+                    memory.remember(ground.heights_m());
                 }
             }
             reach.update(memory.as_ref().map_or(sweep, |memory| memory.extended(sweep)), ground);

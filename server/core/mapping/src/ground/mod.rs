@@ -30,7 +30,7 @@ use crate::vehicle_outline::Outline;
 
 use growth::Growth;
 use plane::NearPlane;
-use polar::{COLUMNS, PolarCells, RANGE_M_MIN, ROWS};
+use polar::{COLUMNS, PolarCells, RANGE_M_MIN, ROWS, Return};
 use surface::{Confidence, Surface};
 
 /// The local ground around the vehicle, ego frame.
@@ -89,6 +89,27 @@ impl Ground {
         self.write_nodes();
         self.measure_own_points(sweep);
         self.leave_out_mirrored(sweep);
+    }
+
+    /// Makes the heights of the sweep's mirror images NaN; what is remembered was not seen from here.
+    fn leave_out_mirrored(&mut self, sweep: &Sweep) {
+        for point in 0..sweep.x.len() - sweep.remembered {
+            let height_m = self.heights_m[point];
+            if height_m < -mirrored::DEPTH_M_MIN {
+                let column = self.azimuths()[point] as usize % COLUMNS;
+                let range_m = (sweep.x[point] * sweep.x[point] + sweep.y[point] * sweep.y[point]).sqrt();
+                let found = Return { range_m, z_m: sweep.z[point] };
+                if self.is_mirrored(column, &found, height_m, sweep.mount_height_m) {
+                    self.heights_m[point] = f32::NAN;
+                }
+            }
+        }
+    }
+
+    /// True if a return of a column, at this height over the ground, is a mirror image; the sensor is at this height,
+    /// metres.
+    pub(crate) fn is_mirrored(&self, column: usize, found: &Return, height_m: f32, sensor_m: f32) -> bool {
+        mirrored::is_mirrored((&self.cells, &self.surface), column, found, height_m, sensor_m)
     }
 
     /// Height of each point of the sweep over the ground, metres; NaN where [`Self::height_over_m`] is, and for the

@@ -16,13 +16,14 @@ pub mod config;
 
 use nalgebra::{Isometry3, Point3};
 
-use crate::azimuth_columns::AzimuthColumns;
+use crate::azimuth_columns::{AzimuthColumns, floor_to_whole};
 use crate::sensor::sweep::Sweep;
 
 use config::{GROUND_S_MAX, MemoryConfig, OBSTACLE_S_MAX, RANGE_M_MAX};
 
 /// Side of a cell, metres. Ours: the cells of the reach stage.
 const CELL_M: f64 = 0.25;
+const CELLS_A_M: f32 = (1.0 / CELL_M) as f32;
 /// Number of stored cells along a side, a power of two: 64 m.
 const SIDE: i64 = 256;
 /// Largest height of ground over or under the local ground, metres. Ours; not tuned.
@@ -44,6 +45,10 @@ const TALL_MIN: f32 = 0.035;
 const TALL_RANGE_M_MIN: f32 = 5.0;
 /// Least distance of the point behind it, metres. Ours: a car is longer.
 const BEHIND_M: f32 = 1.0;
+/// A place that is farther away than [`RANGE_M_MAX`].
+const NOWHERE: u32 = u32::MAX;
+/// Number of cells that make each offset from the vehicle's cell positive: a multiple of [`SIDE`].
+const POSITIVE: u32 = 1024;
 /// Number of directions in which the map may have no return.
 const DIRECTIONS: usize = AzimuthColumns::TWO_DEGREES as usize;
 
@@ -75,6 +80,8 @@ pub(crate) struct Memory {
     /// Points of the newest map and the remembered ones.
     extended: Sweep,
     azimuths: AzimuthColumns,
+    /// By point of the newest map's own: index of its stored cell, or [`NOWHERE`].
+    places: Vec<u32>,
     /// One bit for each stored cell, set if the newest map has a point there.
     seen: Vec<u64>,
     /// What the newest map got.
@@ -99,6 +106,7 @@ impl Memory {
             newest: None,
             extended: Sweep::default(),
             azimuths: AzimuthColumns::new(AzimuthColumns::TWO_DEGREES),
+            places: Vec::new(),
             seen: vec![0; (SIDE * SIDE / 64) as usize],
             state: MemoryState::default(),
         })
@@ -130,40 +138,40 @@ impl Memory {
     }
 
     /// Remembers the points of the newest map's own sweep, which have these heights over the ground.
-    pub fn remember(&mut self, own_points: usize, heights_m: &[f32]) {
+    pub fn remember(&mut self, heights_m: &[f32]) {
         let Some((pose, stamp_ns)) = self.newest else { return };
-        let sweep = std::mem::take(&mut self.extended);
-        let range_squared = RANGE_M_MAX * RANGE_M_MAX;
-        let points = sweep.x.iter().zip(&sweep.y).zip(&sweep.z).zip(heights_m).take(own_points);
-        for (((&x, &y), &z), &height) in points {
+        let (places, sweep) = (std::mem::take(&mut self.places), std::mem::take(&mut self.extended));
+        let (rotation, corner) = (pose.rotation.to_rotation_matrix(), corner(&pose));
+        let up = [0, 1, 2].map(|i| rotation[(2, i)] as f32);
+        for (point, (&place, &height)) in places.iter().zip(heights_m).enumerate() {
             let (is_ground, is_obstacle) = (height.abs() <= GROUND_M_MAX, OBSTACLE_M.contains(&height));
-            if (is_ground || is_obstacle) && x * x + y * y <= range_squared {
-                let point = pose * Point3::new(x, y, z).cast::<f64>();
-                self.insert(point, is_obstacle.then_some(height), stamp_ns);
+            if place != NOWHERE && (is_ground || is_obstacle) {
+                let [x, y, z] = [sweep.x[point], sweep.y[point], sweep.z[point]];
+                let z_m = pose.translation.z + f64::from(up[0] * x + up[1] * y + up[2] * z);
+                let world = world_cell(corner, i64::from(place));
+                self.insert(place, world, z_m, is_obstacle.then_some(height), stamp_ns);
             }
         }
-        self.extended = sweep;
+        (self.places, self.extended) = (places, sweep);
     }
 
-    /// Remembers a point of the ground, or of an obstacle at this height over it.
-    fn insert(&mut self, point: Point3<f64>, obstacle: Option<f32>, stamp_ns: i64) {
-        let world = [point.x, point.y].map(|metres| (metres / CELL_M).floor() as i64);
-        let index = (world[1].rem_euclid(SIDE) * SIDE + world[0].rem_euclid(SIDE)) as usize;
-        let cell = &mut self.cells[index];
+    /// Remembers ground at this height in the world, or an obstacle there that has another height over the ground.
+    fn insert(&mut self, place: u32, world: [i64; 2], z_m: f64, obstacle: Option<f32>, stamp_ns: i64) {
+        let cell = &mut self.cells[place as usize];
         if cell.ground_ns == 0 && cell.obstacle_ns == 0 {
-            self.listed.push(index as u32);
+            self.listed.push(place);
         }
         if cell.world != world {
             *cell = MemoryCell { world, ..MemoryCell::default() };
         }
         if let Some(height_m) = obstacle {
-            if cell.obstacle_ns != stamp_ns || point.z > cell.obstacle_m {
-                (cell.obstacle_m, cell.tall_m) = (point.z, height_m);
+            if cell.obstacle_ns != stamp_ns || z_m > cell.obstacle_m {
+                (cell.obstacle_m, cell.tall_m) = (z_m, height_m);
             }
             cell.obstacle_ns = stamp_ns;
         } else {
-            let is_lower = cell.ground_ns != stamp_ns || point.z < cell.ground_m;
-            cell.ground_m = if is_lower { point.z } else { cell.ground_m };
+            let is_lower = cell.ground_ns != stamp_ns || z_m < cell.ground_m;
+            cell.ground_m = if is_lower { z_m } else { cell.ground_m };
             cell.ground_ns = stamp_ns;
         }
     }
@@ -219,36 +227,44 @@ impl Memory {
         }
     }
 
-    /// Finds the stored cells in which the map has a point.
+    /// Finds the stored cell of each point of the map, and those in which it has one.
     fn find_seen_cells(&mut self, map_from_ego: &Isometry3<f64>) {
-        let Self { seen, extended: sweep, .. } = self;
+        let Self { places, seen, extended: Sweep { x: xs, y: ys, z: zs, .. }, .. } = self;
+        let rotation = map_from_ego.rotation.to_rotation_matrix();
+        let [across, along] = [0, 1].map(|axis| [0, 1, 2].map(|i| rotation[(axis, i)] as f32 * CELLS_A_M));
+        let [(first_x, in_x), (first_y, in_y)] = [0, 1].map(|axis| {
+            let cells = map_from_ego.translation.vector[axis] / CELL_M;
+            let first = (cells.floor() as i64).rem_euclid(SIDE) as u32;
+            (first, (cells - cells.floor()) as f32 + POSITIVE as f32)
+        });
+        places.resize(xs.len(), NOWHERE);
+        let n = places.len();
+        let (xs, ys, zs) = (&xs[..n], &ys[..n], &zs[..n]);
+        // Without a branch, so that the compiler vectorises it.
+        for i in 0..n {
+            let (x, y, z) = (xs[i], ys[i], zs[i]);
+            let cell_x = first_x.wrapping_add(floor_to_whole(in_x + across[0] * x + across[1] * y + across[2] * z));
+            let cell_y = first_y.wrapping_add(floor_to_whole(in_y + along[0] * x + along[1] * y + along[2] * z));
+            let place = cell_y % SIDE as u32 * SIDE as u32 + cell_x % SIDE as u32;
+            places[i] = if x * x + y * y <= RANGE_M_MAX * RANGE_M_MAX { place } else { NOWHERE };
+        }
         seen.fill(0);
-        let range_squared = RANGE_M_MAX * RANGE_M_MAX;
-        for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
-            if x * x + y * y <= range_squared {
-                let point = map_from_ego * Point3::new(x, y, z).cast::<f64>();
-                let [i, j] = [point.x, point.y].map(|metres| ((metres / CELL_M).floor() as i64).rem_euclid(SIDE));
-                let index = (j * SIDE + i) as usize;
-                seen[index / 64] |= 1 << (index % 64);
-            }
+        for place in places.iter().filter(|place| **place != NOWHERE) {
+            seen[*place as usize / 64] |= 1 << (place % 64);
         }
     }
 
     /// By direction of two degrees: the range of the farthest point that the map has there, within the range of the
     /// memory, metres; 0 without a point.
     fn view_m(&self, ego_from_map: &Isometry3<f64>, map_from_ego: &Isometry3<f64>) -> [f32; DIRECTIONS] {
-        let middle = map_from_ego.translation.vector;
-        let first = [middle.x, middle.y].map(|metres| (metres / CELL_M).floor() as i64 - SIDE / 2);
+        let (middle, corner) = (map_from_ego.translation.vector, corner(map_from_ego));
         let mut view_m = [0f32; DIRECTIONS];
         for (word, bits) in self.seen.iter().enumerate() {
             let mut rest = *bits;
             while rest != 0 {
                 let index = word as i64 * 64 + i64::from(rest.trailing_zeros());
                 rest &= rest - 1;
-                // The world's cell of this place that is in the square about the vehicle.
-                let stored = [index % SIDE, index / SIDE];
-                let [x, y] = [0, 1].map(|i| first[i] + (stored[i] - first[i]).rem_euclid(SIDE));
-                let [x, y] = [x, y].map(|cell| (cell as f64 + 0.5) * CELL_M);
+                let [x, y] = world_cell(corner, index).map(|cell| (cell as f64 + 0.5) * CELL_M);
                 let point = (ego_from_map * Point3::new(x, y, middle.z)).cast::<f32>();
                 let farthest_m = &mut view_m[self.azimuths.column(point.x, point.y) as usize];
                 *farthest_m = farthest_m.max(libm::hypotf(point.x, point.y));
@@ -263,6 +279,18 @@ impl Memory {
         }
         self.state.drops += 1;
     }
+}
+
+/// The first cell of the world, along x and y, of the square of stored cells about the vehicle.
+fn corner(map_from_ego: &Isometry3<f64>) -> [i64; 2] {
+    let middle = map_from_ego.translation.vector;
+    [middle.x, middle.y].map(|metres| (metres / CELL_M).floor() as i64 - SIDE / 2)
+}
+
+/// The world's cell that is stored at a place and lies in the square with this corner.
+fn world_cell(corner: [i64; 2], place: i64) -> [i64; 2] {
+    let stored = [place % SIDE, place / SIDE];
+    [0, 1].map(|axis| corner[axis] + (stored[axis] - corner[axis]).rem_euclid(SIDE))
 }
 
 /// True if a pose follows from the newest one: a vehicle can have moved so far in the time between.
@@ -302,7 +330,7 @@ mod tests {
     /// Adds a map with these points over the ground z = 0, and returns how many points it gets from memory.
     fn map(memory: &mut Memory, sweep: &Sweep, seconds: f64) -> usize {
         memory.extend(sweep, Some(&Isometry3::identity()), at(seconds));
-        memory.remember(sweep.x.len(), &sweep.z);
+        memory.remember(&sweep.z);
         memory.state().points
     }
 

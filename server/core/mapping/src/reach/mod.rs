@@ -28,16 +28,16 @@ mod edges;
 pub(crate) mod flood;
 mod joins;
 mod obstacles;
-mod polar_runs;
+mod places;
 mod shadow;
 mod steps;
 mod troughs;
 
 use std::ops::Range;
-use std::sync::{Arc, LazyLock};
+use std::sync::Arc;
 
 use crate::ground::Ground;
-use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside, row_middles_m};
+use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
 use crate::ground::surface::Confidence;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
@@ -46,13 +46,12 @@ use bits::Bits;
 use blind_zone::BlindZone;
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
-use directions::Directions;
 use edges::Edges;
 use flood::Flood;
 use joins::Joins;
 use obstacles::Obstacles;
-use polar_runs::{PolarRuns, WORD};
-use shadow::{Place, Shadow};
+use places::{PLACES, Places, WORD};
+use shadow::Shadow;
 use steps::Steps;
 use troughs::Troughs;
 
@@ -115,28 +114,6 @@ pub(crate) struct ReachBits<'a> {
     /// The cells with a return from the ground.
     pub seen: &'a Bits,
 }
-
-/// Where the cells lie: the same for every vehicle.
-struct Places {
-    /// By cell: the polar cell of its centre.
-    polar_of_cell: Vec<PolarIndex>,
-    polar_runs: PolarRuns,
-    row_middles_m: [f32; ROWS],
-    of_shadows: Arc<[Place]>,
-    directions: Directions,
-}
-
-static PLACES: LazyLock<Places> = LazyLock::new(|| {
-    let centres_m = || (0..SIDE * SIDE).map(cells::centre_m);
-    let polar_of_cell: Vec<_> = centres_m().map(|[x, y]| PolarIndex::at(x, y)).collect();
-    Places {
-        polar_runs: PolarRuns::new(&polar_of_cell),
-        polar_of_cell,
-        row_middles_m: row_middles_m(),
-        of_shadows: centres_m().map(Place::at).collect(),
-        directions: Directions::new(),
-    }
-});
 
 /// Closed cells and reached ground around the vehicle, ego frame.
 #[derive(Clone)]
@@ -412,7 +389,7 @@ impl Reach {
     }
 
     /// Opens the hidden cells in gaps of seen ground that a closing of the open cells fills: the thin shadows of trunks
-    /// and bushes, which would cut the way of the disc's middle. Near ground alone: [`Directions::near`].
+    /// and bushes, which would cut the way of the disc's middle. Near ground alone: [`directions::Directions::near`].
     fn open_thin_shadows(&mut self) {
         let Self { open, hidden_gaps, dilated, outside, wide, places, .. } = self;
         dilated.clear();

@@ -189,7 +189,7 @@ fn mirror_images_under_the_feet_of_a_person_change_nothing() {
         let depth_m = 0.35 + step as f32 / 100.0;
         add(&mut mirrored, [7.0 + 0.3 * libm::cosf(turn), 1.0 + 0.3 * libm::sinf(turn), -depth_m]);
     }
-    let [mirrored, plain] = [&mirrored, &plain].map(|sweep| freespace(sweep));
+    let [mirrored, plain] = [&mirrored, &plain].map(freespace);
     for cell in 0..classes(&plain).len() {
         assert_eq!(class_name(&mirrored, cell), class_name(&plain, cell), "{:?}", centre(cell));
     }

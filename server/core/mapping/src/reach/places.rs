@@ -1,7 +1,40 @@
-//! Runs of cells of the grid whose centres lie in one polar cell: what is known of the polar cell is copied to 64 bits
-//! of the grid at a time.
+//! Where the cells of the grid lie: tables that are made once and are the same for every vehicle.
+//!
+//! Runs of cells have their centres in one polar cell: what is known of the polar cell is copied to 64 bits of the grid
+//! at a time.
 
-use crate::ground::polar::PolarIndex;
+use std::sync::{Arc, LazyLock};
+
+use crate::ground::polar::{PolarIndex, ROWS, row_middles_m};
+
+use super::cells::{self, SIDE};
+use super::directions::Directions;
+use super::shadow::Place;
+
+/// The tables.
+pub struct Places {
+    /// By cell: the polar cell of its centre.
+    pub polar_of_cell: Vec<PolarIndex>,
+    pub polar_runs: PolarRuns,
+    /// Range of the middle of each polar row, metres.
+    pub row_middles_m: [f32; ROWS],
+    /// By cell.
+    pub of_shadows: Arc<[Place]>,
+    pub directions: Directions,
+}
+
+/// The places of the reach stage's cells.
+pub static PLACES: LazyLock<Places> = LazyLock::new(|| {
+    let centres_m = || (0..SIDE * SIDE).map(cells::centre_m);
+    let polar_of_cell: Vec<_> = centres_m().map(|[x, y]| PolarIndex::at(x, y)).collect();
+    Places {
+        polar_runs: PolarRuns::new(&polar_of_cell),
+        polar_of_cell,
+        row_middles_m: row_middles_m(),
+        of_shadows: centres_m().map(Place::at).collect(),
+        directions: Directions::new(),
+    }
+});
 
 /// Number of cells of a word of bits.
 pub const WORD: usize = 64;
@@ -64,7 +97,7 @@ impl PolarRuns {
 
 #[cfg(test)]
 mod tests {
-    use super::super::cells::{SIDE, centre_m};
+    use super::super::cells::centre_m;
     use super::*;
     use crate::ground::polar::CELLS;
 
