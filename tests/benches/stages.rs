@@ -97,13 +97,10 @@ fn main() {
             }
         }
     }
-    for name in Stages::NAMES {
-        let Some((owns, floors)) = times.get_mut(name) else { continue };
+    for (name, (owns, floors)) in &mut times {
         let own_ms = median_ms(owns).unwrap_or_default();
-        match median_ms(floors) {
-            Some(floor_ms) => println!("| {name} | {own_ms:.2} | {floor_ms:.2} | {:.1} |", own_ms / floor_ms),
-            None => println!("| {name} | {own_ms:.2} | | |"),
-        }
+        let floor_ms = median_ms(floors).unwrap_or(f64::NAN);
+        println!("| {name} | {own_ms:.2} | {floor_ms:.2} | {:.1} |", own_ms / floor_ms);
     }
 }
 
@@ -228,7 +225,6 @@ impl Stages {
         Some(match name {
             "decode" => timed(|| floor.decode(&self.datagrams)),
             "drivability" => timed(|| floor.scatter_polar(scan)),
-            "height_difference" => timed(|| floor.scatter_square(scan)),
             "terrain" => timed(|| floor.sum_moments(scan)),
             "encode" => timed(|| floor.count_runs()),
             _ => return None,
@@ -317,7 +313,6 @@ struct Floor {
     points: Vec<[f32; 3]>,
     /// Number, least and greatest height by cell.
     polar: Vec<[f32; 3]>,
-    square: Vec<[f32; 2]>,
     /// Number, sums and products of the coordinates by cell.
     moments: Vec<[f32; 10]>,
     classes: Vec<u8>,
@@ -336,7 +331,6 @@ impl Floor {
             azimuths: (0..36_000).map(|i| (i as f32 / 100.0).to_radians().sin_cos().into()).collect(),
             points: Vec::new(),
             polar: vec![[0.0; 3]; 360 * 64],
-            square: vec![[0.0; 2]; SIDE * SIDE],
             moments: vec![[0.0; 10]; SIDE * SIDE],
             classes,
         }
@@ -367,18 +361,6 @@ impl Floor {
             *cell = [cell[0] + 1.0, cell[1].min(z), cell[2].max(z)];
         }
         self.polar[0][0]
-    }
-
-    /// Least and greatest height by square cell.
-    fn scatter_square(&mut self, scan: &Scan) -> f32 {
-        self.square.fill([f32::INFINITY, f32::NEG_INFINITY]);
-        for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
-            if let Some(cell) = square_cell(x, y) {
-                let cell = &mut self.square[cell];
-                *cell = [cell[0].min(z), cell[1].max(z)];
-            }
-        }
-        self.square[0][0]
     }
 
     /// The ten sums from which the planes of cells follow.

@@ -50,7 +50,7 @@ use edges::Edges;
 use flood::Flood;
 use joins::Joins;
 use obstacles::Obstacles;
-use places::{PLACES, Places, WORD};
+use places::{CellPlaces, PLACES, WORD};
 use shadow::Shadow;
 use steps::Steps;
 use troughs::Troughs;
@@ -119,7 +119,7 @@ pub(crate) struct ReachBits<'a> {
 #[derive(Clone)]
 pub struct Reach {
     config: ReachConfig,
-    places: &'static Places,
+    places: &'static CellPlaces,
     /// Indices of the cells under the vehicle.
     under_vehicle: Vec<usize>,
     obstacles: Obstacles,

@@ -12,7 +12,7 @@ use super::directions::Directions;
 use super::shadow::Place;
 
 /// The tables.
-pub struct Places {
+pub struct CellPlaces {
     /// By cell: the polar cell of its centre.
     pub polar_of_cell: Vec<PolarIndex>,
     pub polar_runs: PolarRuns,
@@ -24,10 +24,10 @@ pub struct Places {
 }
 
 /// The places of the reach stage's cells.
-pub static PLACES: LazyLock<Places> = LazyLock::new(|| {
+pub static PLACES: LazyLock<CellPlaces> = LazyLock::new(|| {
     let centres_m = || (0..SIDE * SIDE).map(cells::centre_m);
     let polar_of_cell: Vec<_> = centres_m().map(|[x, y]| PolarIndex::at(x, y)).collect();
-    Places {
+    CellPlaces {
         polar_runs: PolarRuns::new(&polar_of_cell),
         polar_of_cell,
         row_middles_m: row_middles_m(),
