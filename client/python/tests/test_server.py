@@ -1,6 +1,8 @@
 """Against a running server, whose addresses are in CLEARWAY_GRPC, CLEARWAY_ZENOH and CLEARWAY_RECORDING."""
 
+import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -13,6 +15,7 @@ import clearway
 GRPC, ZENOH, RECORDING = (os.environ.get(f"CLEARWAY_{name}", "") for name in ("GRPC", "ZENOH", "RECORDING"))
 pytestmark = pytest.mark.skipif(not GRPC, reason="CLEARWAY_GRPC names no server")
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+SUBSCRIPTIONS = json.loads((Path(__file__).resolve().parents[2] / "golden" / "subscriptions.json").read_text())
 TRANSPORTS = [{"address": GRPC}, {"address": f"zenoh:{ZENOH}", "vehicle": "car"}]
 
 
@@ -30,6 +33,17 @@ def test_the_newest_map_has_numpy_arrays(transport):
     assert m.header.sensors[0].returns > 1000
     with pytest.raises(ValueError, match="read-only"):
         layer.classes[0, 0] = 1
+
+
+@pytest.mark.parametrize("row", SUBSCRIPTIONS, ids=lambda row: str(row["options"]))
+def test_every_option_is_served_or_refused_as_the_golden_table_says(row):
+    with clearway.watch(GRPC, **row["options"]) as maps:
+        if row["refused"] is None:
+            assert next(maps).vehicle == "car"
+            return
+        with pytest.raises(clearway.ClearwayError, match=re.escape(row["refused"]["says"])) as refused:
+            next(maps)
+    assert refused.value.reason == row["refused"]["code"]
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])

@@ -8,6 +8,7 @@ mod nav2;
 mod planners;
 mod python;
 mod streams;
+mod subscriptions;
 mod viewers;
 
 use std::future::ready;
