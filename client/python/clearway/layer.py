@@ -20,7 +20,7 @@ from .errors import ClearwayError, DecodeError
 from .grid import CartesianGrid, Grid, RadialGrid
 from .limits import MAP_PARTS_MAX, RGB_MAX, SAFE_POINT_STEPS_MAX
 from .questions import BLOCKS, FREE, LOW, Along, Answer, Asked, Obstacle
-from .shapes import Arc, Outline
+from .shapes import Arc, Outline, finite
 from .v1 import map_pb2
 
 
@@ -124,20 +124,24 @@ class Layer:
         """True for each cell whose class means occupied, in the shape of the grid."""
         return self._means(Meaning.OCCUPIED)
 
+    def _cell_at(self, x_m: float, y_m: float) -> int:
+        return int(self.grid.cells_at(np.array(finite("x_m", x_m)), np.array(finite("y_m", y_m))))
+
     def class_at(self, x_m: float, y_m: float) -> str:
-        """Name of the class at a point (ego frame, metres); "unknown" outside the grid."""
-        cell = int(self.grid.cells_at(np.array(x_m), np.array(y_m)))
+        """Name of the class at a point (ego frame, metres); "unknown" outside the grid. A coordinate that is not finite
+        raises a `ClearwayError`, as in `meaning_at` and `value_at`."""
+        cell = self._cell_at(x_m, y_m)
         return "unknown" if cell < 0 else self.legend[int(self.classes.flat[cell])]
 
     def meaning_at(self, x_m: float, y_m: float) -> Meaning:
         """Meaning of the class at a point (ego frame, metres); `Meaning.UNKNOWN` outside the grid."""
-        cell = int(self.grid.cells_at(np.array(x_m), np.array(y_m)))
+        cell = self._cell_at(x_m, y_m)
         return Meaning.UNKNOWN if cell < 0 else self.legend_entries[int(self.classes.flat[cell])].meaning
 
     def value_at(self, channel: str, x_m: float, y_m: float) -> float:
         """Value of a channel at a point (ego frame, metres), in the channel's unit; NaN if nothing is known of the
         cell."""
-        cell = int(self.grid.cells_at(np.array(x_m), np.array(y_m)))
+        cell = self._cell_at(x_m, y_m)
         return math.nan if cell < 0 else float(self.channels[channel].values.flat[cell])
 
     def is_free(self, polygon: Sequence[tuple[float, float]]) -> bool:

@@ -69,6 +69,9 @@ def test_an_error_names_the_value_and_what_is_needed():
         layer.is_free([(0, 0), (1, float("nan")), (1, 1)])
     with pytest.raises(clearway.ClearwayError, match=r"edges 0 and 2 of the polygon cross near \(0.500, 0.500\) m"):
         layer.is_free([(0, 0), (1, 1), (1, 0), (0, 1)])
+    for ask in (layer.class_at, layer.meaning_at, lambda x, y: layer.value_at("class", x, y)):
+        with pytest.raises(clearway.ClearwayError, match="y_m is nan; a finite number is needed"):
+            ask(1.0, float("nan"))
 
 
 def test_the_clearance_is_the_distance_to_the_nearest_cell_that_is_not_free():
