@@ -40,8 +40,8 @@ impl Selection {
     /// Checks the selection of a reader of this vehicle.
     ///
     /// # Errors
-    /// `NotFound` for an unknown layer; `InvalidArgument` for a value that is not allowed, or a region outside the
-    /// grids. Both name the value and what is allowed.
+    /// `InvalidArgument` for an unknown layer, a value that is not allowed, or a region outside the grids; it names the
+    /// value and what is allowed.
     pub fn new(served: &Served, selection: v1::Selection) -> Result<Self, Status> {
         let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas, states, plans } = selection;
         served.check_layers(&layers)?;
