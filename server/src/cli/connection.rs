@@ -13,6 +13,7 @@ use crate::cli::shared::output::usage_error;
 /// The gRPC address of a server with the default configuration.
 const ADDRESS: &str = "localhost:50051";
 /// The environment variables that name certificates.
+#[cfg(feature = "zenoh")]
 const VARIABLES: &str = "CLEARWAY_CA, CLEARWAY_CERT and CLEARWAY_KEY name PEM files";
 
 /// The server of a client. `CLEARWAY_CA` names the PEM file of the CA certificate that signed the server's certificate,

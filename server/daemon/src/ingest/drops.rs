@@ -73,6 +73,7 @@ impl DropCounters {
 
     /// Counts `count` parts of messages (points, fields, transforms, packets) that were refused while the rest of their
     /// messages is used.
+    #[cfg(feature = "zenoh")]
     pub(crate) fn record_refused_parts(&self, count: u64) {
         *locked(&self.refused_messages).entry("ros_part").or_default() += count;
     }

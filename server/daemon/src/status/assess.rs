@@ -73,6 +73,7 @@ impl VehicleStatus {
 
     /// Time until the newest map, whose capture ended then, is stale; 0 if it is. The stamp of a recorded map says
     /// nothing about now, so that its age counts from its publication.
+    #[cfg(feature = "zenoh")]
     pub(crate) fn fresh_for(&self, capture_end_ns: i64) -> Duration {
         let state = locked(&self.changing);
         let age = if state.has_recorded_stamps {
