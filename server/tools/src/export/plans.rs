@@ -5,7 +5,7 @@ use clearway_journal::mcap_reader::Message;
 use clearway_proto::plan;
 use prost::Message as _;
 
-/// The plan of an event of a journal, if it is one that can be drawn.
+/// The plan of an event of a journal; `None` for other events, and for a plan that cannot be drawn.
 pub fn plan_of(message: &Message) -> Option<v1::Plan> {
     message.journal_of()?;
     match v1::Event::decode(message.data.clone()).ok()?.body? {

@@ -9,7 +9,7 @@ use super::surface::{Confidence, Surface};
 
 /// Least depth of a mirror image under the ground, metres. Ours: shallower ones are noise.
 pub const DEPTH_M_MIN: f32 = 0.3;
-/// Its greatest range, metres. Ours: farther away a column of the polar cells is as wide as a ditch.
+/// Greatest range of a mirror image, metres. Ours: farther away a column of the polar cells is as wide as a ditch.
 const RANGE_M_MAX: f32 = 15.0;
 /// Least height of seen ground over the ray, metres, and its largest height over the estimate. Ours; not tuned.
 const OVER_RAY_M: f32 = 0.1;

@@ -22,7 +22,7 @@ use clearway_client::MapView;
 const CELL_BYTES: u32 = 4;
 /// Bytes of a point: x, y, z.
 const POINT_BYTES: u32 = 12;
-/// Red, green, blue and opacity of plans: those of the page.
+/// Red, green, blue and opacity of plans: the colour that the page draws them with.
 const PLAN_RGBA: [f32; 4] = [1.0, 0.31, 0.85, 1.0];
 /// Width of a plan's lines, their height over the ground, and the height of its letters, in metres.
 const PLAN_LINE_M: f64 = 0.15;
