@@ -30,7 +30,8 @@ pub const PLANNER_BYTES_MAX: usize = 64;
 pub const PLAN_TEXT_BYTES_MAX: usize = 256;
 /// Most bytes of an encoded plan: its points with headings, and ample for the rest.
 pub const PLAN_BYTES_MAX: usize = 128 << 10;
-/// Greatest time by which the stamp of a plan may be ahead of the server's clock, in ns. Ours: an observation may be as far ahead.
+/// Greatest time by which the stamp of a plan may be ahead of the server's clock, in ns. Ours: an observation may be
+/// as far ahead.
 pub const PLAN_AHEAD_NS_MAX: i64 = 10_000_000_000;
 /// Greatest difference of the stamps of a plan and of a map over which it is drawn, in ns. Ours: two periods of a
 /// planner that plans once a second.
