@@ -267,6 +267,7 @@ impl Shared {
         self.sweep.set_scan(scan, &self.calibration, &self.mount);
         self.ground.estimate(&self.sweep);
         self.reach.update(&self.sweep, &self.ground);
+        self.reach.flood();
     }
 }
 

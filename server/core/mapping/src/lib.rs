@@ -19,6 +19,7 @@
 //! | [`map`] | what a map contains |
 //! | `azimuth_columns`, `value_check` | position -> column of azimuth; value of a key -> error |
 //! | [`vehicle_outline`] | the vehicle, seen from above |
+//! | `wide` | a loop over points -> the same with the widest registers of the processor |
 //! | [`scan_file`] | KITTI `.bin`, nuScenes `.pcd.bin`, `.pcd` -> scan |
 
 // The core is pure: server/core/clippy.toml lists what it must not use.
@@ -44,3 +45,4 @@ pub mod scan_file;
 pub mod sensor;
 mod value_check;
 pub mod vehicle_outline;
+mod wide;

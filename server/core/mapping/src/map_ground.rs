@@ -11,7 +11,7 @@ use crate::ground::config::Variant;
 use crate::layer::registry::MapsConfig;
 use crate::memory::{Memory, MemoryState};
 use crate::reach::Reach;
-use crate::sensor::rays::Rays;
+use crate::sensor::rays::{Rays, ScanExtras};
 use crate::sensor::scan::SensorScan;
 use crate::sensor::sweep::Sweep;
 
@@ -51,9 +51,12 @@ impl MapGround {
         Self { estimates, is_known: false, sole_scan: None, scan_heights_m: Vec::new() }
     }
 
-    /// Estimates the ground of a map from its points and the remembered ones, and what the vehicle can reach on it.
-    /// `scan` is the newest scan of the map's source.
-    pub fn estimate(&mut self, merged: &MergedScans, scan: &SensorScan) {
+    /// Estimates the ground of a map from its points and the remembered ones, and what the vehicle can reach on it, as
+    /// far as layers use them. `scan` is the newest scan of the map's source.
+    pub fn estimate(&mut self, merged: &MergedScans, scan: &SensorScan, uses: ScanExtras) {
+        if !uses.ground {
+            return;
+        }
         let sweep = &*merged.sweep;
         self.sole_scan = merged.sole_scan.map(|number| (merged.source as u16, number));
         if let Some(Estimates { ground, reach, memory, map_from_ground }) = &mut self.estimates {
@@ -66,6 +69,9 @@ impl MapGround {
                 }
             }
             reach.update(memory.as_ref().map_or(sweep, |memory| memory.extended(sweep)), ground);
+            if uses.reached {
+                reach.flood();
+            }
             (*map_from_ground, self.is_known) = (scan.map_from_ego, true);
         }
     }

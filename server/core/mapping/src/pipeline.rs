@@ -199,7 +199,7 @@ impl Pipeline {
         if self.scans_since_map > 0 || self.fusion.is_waiting() || scan.end_ns != merged.end_ns {
             return None;
         }
-        self.ground.estimate(merged, scan);
+        self.ground.estimate(merged, scan, self.layers.uses());
         self.layers.integrate(&self.ground.rays(scan, self.map.source));
         self.make_layers();
         Some(&self.map)
@@ -306,8 +306,8 @@ impl Pipeline {
     /// Estimates the ground of a map, and what the vehicle can reach on it, if a layer uses them.
     fn estimate_ground(&mut self, merged: Option<&MergedScans>) {
         let scans = self.inputs.scans();
-        if let Some(merged) = merged.filter(|_| self.layers.uses().ground) {
-            self.ground.estimate(merged, &scans[merged.source]);
+        if let Some(merged) = merged {
+            self.ground.estimate(merged, &scans[merged.source], self.layers.uses());
         }
     }
 

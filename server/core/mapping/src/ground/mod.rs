@@ -27,6 +27,7 @@ use nalgebra::{Isometry3, Point3};
 use crate::azimuth_columns::floor_to_whole;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
+use crate::wide::{WideLoop, run_wide};
 
 use growth::Growth;
 use plane::NearPlane;
@@ -57,15 +58,6 @@ const CHUNK: usize = 1024;
 /// Columns of [`Ground::nodes`].
 const WIDTH: usize = COLUMNS + 2;
 
-/// Where points lie on the surface; a buffer.
-struct Places {
-    cells: [u32; CHUNK],
-    /// The node behind each point.
-    nodes: [u32; CHUNK],
-    /// Shares of the way to the next row and to the next column of nodes.
-    shares: [[f32; CHUNK]; 2],
-}
-
 impl Ground {
     /// The ground before the first sweep, around a vehicle with this outline.
     pub fn new(outline: Outline) -> Self {
@@ -87,7 +79,10 @@ impl Ground {
         self.growth.grow(&self.cells, &self.plane);
         self.surface.cover(&self.growth, &self.plane);
         self.write_nodes();
-        self.measure_own_points(sweep);
+        let mut heights_m = std::mem::take(&mut self.heights_m);
+        heights_m.resize(sweep.x.len(), 0.0);
+        run_wide(MeasurePoints { ground: self, sweep, heights_m: &mut heights_m });
+        self.heights_m = heights_m;
         self.leave_out_mirrored(sweep);
     }
 
@@ -150,52 +145,6 @@ impl Ground {
                 let point = moved * Point3::new(x, y, z);
                 self.height_over_m(point.x, point.y, point.z)
             })),
-        }
-    }
-
-    fn measure_own_points(&mut self, sweep: &Sweep) {
-        let mut heights_m = std::mem::take(&mut self.heights_m);
-        heights_m.resize(sweep.x.len(), 0.0);
-        let mut places = Places { cells: [0; CHUNK], nodes: [0; CHUNK], shares: [[0.0; CHUNK]; 2] };
-        let [rows, turns] = self.cells.point_coordinates();
-        let points = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
-        let coordinates = rows.chunks(CHUNK).zip(turns.chunks(CHUNK));
-        for ((((xs, ys), zs), (rows, turns)), heights_m) in points.zip(coordinates).zip(heights_m.chunks_mut(CHUNK)) {
-            self.measure_chunk([xs, ys, zs], [rows, turns], &mut places, heights_m);
-        }
-        self.heights_m = heights_m;
-    }
-
-    /// As [`Self::height_over`] for up to [`CHUNK`] points. What needs no table is computed first and without branches,
-    /// so that the compiler vectorises it.
-    fn measure_chunk(
-        &self,
-        [xs, ys, zs]: [&[f32]; 3],
-        [rows, turns]: [&[f32]; 2],
-        places: &mut Places,
-        heights_m: &mut [f32],
-    ) {
-        let n = xs.len().min(CHUNK);
-        let (xs, ys, zs, rows, turns) = (&xs[..n], &ys[..n], &zs[..n], &rows[..n], &turns[..n]);
-        let Places { cells, nodes, shares: [us, vs] } = places;
-        let (cells, nodes, us, vs) = (&mut cells[..n], &mut nodes[..n], &mut us[..n], &mut vs[..n]);
-        for i in 0..n {
-            cells[i] = floor_to_whole(rows[i]) * COLUMNS as u32 + floor_to_whole(turns[i]);
-            let (row, column) = (rows[i] + 0.5, turns[i] + 0.5);
-            let (whole_row, whole_column) = (floor_to_whole(row), floor_to_whole(column));
-            (us[i], vs[i]) = (row - whole_row as i32 as f32, column - whole_column as i32 as f32);
-            nodes[i] = whole_row * WIDTH as u32 + whole_column;
-        }
-        let confidences = self.surface.confidences();
-        for i in 0..n {
-            let (x, y, z) = (xs[i], ys[i], zs[i]);
-            let is_near = x * x + y * y < RANGE_M_MIN * RANGE_M_MIN;
-            let confidence = confidences.get(cells[i] as usize).copied().unwrap_or_default();
-            heights_m[i] = if is_near || confidence == Confidence::None {
-                self.height_over(x, y, z, [rows[i], turns[i]])
-            } else {
-                z - self.between_nodes(nodes[i] as usize, [us[i], vs[i]])
-            };
         }
     }
 
@@ -270,5 +219,45 @@ impl Ground {
         let (i, j) = (floor_to_whole(row), floor_to_whole(column));
         let (u, v) = (row - i as f32, column - j as f32);
         (self.between_nodes(i as usize * WIDTH + j as usize, [u, v]), confidence)
+    }
+}
+
+/// Writes the height of each point of a sweep over its ground, as [`Ground::height_over_m`].
+struct MeasurePoints<'a> {
+    ground: &'a Ground,
+    sweep: &'a Sweep,
+    heights_m: &'a mut [f32],
+}
+
+impl WideLoop for MeasurePoints<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let (ground, Sweep { x, y, z, .. }, [rows, turns]) =
+            (self.ground, self.sweep, self.ground.cells.point_coordinates());
+        let (mut cells, mut nodes, [mut us, mut vs]) = ([0; CHUNK], [0; CHUNK], [[0.0; CHUNK]; 2]);
+        let confidences = ground.surface.confidences();
+        for (chunk, heights_m) in self.heights_m.chunks_mut(CHUNK).enumerate() {
+            let (first, n) = (chunk * CHUNK, heights_m.len().min(CHUNK));
+            let [xs, ys, zs] = [x, y, z].map(|axis| &axis[first..first + n]);
+            let [rows, turns] = [rows, turns].map(|axis| &axis[first..first + n]);
+            // What needs no table comes first and without branches, so that the compiler vectorises it.
+            for i in 0..n {
+                cells[i] = floor_to_whole(rows[i]) * COLUMNS as u32 + floor_to_whole(turns[i]);
+                let (row, column) = (rows[i] + 0.5, turns[i] + 0.5);
+                let (whole_row, whole_column) = (floor_to_whole(row), floor_to_whole(column));
+                (us[i], vs[i]) = (row - whole_row as i32 as f32, column - whole_column as i32 as f32);
+                nodes[i] = whole_row * WIDTH as u32 + whole_column;
+            }
+            for i in 0..n {
+                let (x, y, z) = (xs[i], ys[i], zs[i]);
+                let is_near = x * x + y * y < RANGE_M_MIN * RANGE_M_MIN;
+                let confidence = confidences.get(cells[i] as usize).copied().unwrap_or_default();
+                heights_m[i] = if is_near || confidence == Confidence::None {
+                    ground.height_over(x, y, z, [rows[i], turns[i]])
+                } else {
+                    z - ground.between_nodes(nodes[i] as usize, [us[i], vs[i]])
+                };
+            }
+        }
     }
 }

@@ -4,6 +4,8 @@
 //! cells around it. The columns wrap. Rows are stored with copies of the columns beyond both ends, so that a whole row
 //! is added to the sums at a time.
 
+use crate::wide::{WideLoop, run_wide};
+
 use super::polar::{COLUMNS, ROWS};
 
 /// Number of copied columns at each end of a row.
@@ -48,17 +50,31 @@ impl Neighbourhood {
     /// Sums the neighbourhoods of a row's cells. The weight of a neighbour is the product of `kernel` along the rows
     /// and along the columns; its middle belongs to the cell itself.
     pub fn sum_around<const N: usize>(&mut self, row: usize, kernel: [f32; N]) {
+        run_wide(SumAround { cells: self, row, kernel });
+    }
+}
+
+struct SumAround<'a, const N: usize> {
+    cells: &'a mut Neighbourhood,
+    row: usize,
+    kernel: [f32; N],
+}
+
+impl<const N: usize> WideLoop for SumAround<'_, N> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { cells, row, kernel } = self;
         let reach = N / 2;
-        self.weight_sums.fill(0.0);
-        self.value_sums.fill(0.0);
+        cells.weight_sums.fill(0.0);
+        cells.value_sums.fill(0.0);
         for near in row.saturating_sub(reach)..(row + reach + 1).min(ROWS) {
             for (offset, across) in kernel.into_iter().enumerate() {
                 let factor = kernel[near + reach - row] * across;
                 let first = near * WIDTH + MARGIN + offset - reach;
-                let (weights, weighted) = (&self.weights[first..][..COLUMNS], &self.weighted[first..][..COLUMNS]);
+                let (weights, weighted) = (&cells.weights[first..][..COLUMNS], &cells.weighted[first..][..COLUMNS]);
                 for column in 0..COLUMNS {
-                    self.weight_sums[column] += factor * weights[column];
-                    self.value_sums[column] += factor * weighted[column];
+                    cells.weight_sums[column] += factor * weights[column];
+                    cells.value_sums[column] += factor * weighted[column];
                 }
             }
         }

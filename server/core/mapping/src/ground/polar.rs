@@ -10,6 +10,7 @@ use std::f32::consts::TAU;
 use crate::azimuth_columns::{AzimuthColumns, floor_to_whole};
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
+use crate::wide::{WideLoop, run_wide};
 
 /// Number of columns: two degrees each. Ours: at 10 m a column is about as wide as a row is deep.
 pub const COLUMNS: usize = AzimuthColumns::TWO_DEGREES as usize;
@@ -86,48 +87,11 @@ impl PolarCells {
     /// 30 % and 1.5 m) cannot be ground and is left out, and so are the returns of the vehicle itself.
     pub fn sort_points(&mut self, sweep: &Sweep) {
         self.cells.fill(EMPTY);
-        let [mut rows, mut turns] = std::mem::take(&mut self.coordinates);
-        rows.resize(sweep.x.len(), 0.0);
-        turns.resize(sweep.x.len(), 0.0);
-        let (mut cells, mut keys) = ([0_u32; CHUNK], [NONE; CHUNK]);
-        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
-        let coordinates = rows.chunks_mut(CHUNK).zip(turns.chunks_mut(CHUNK));
-        for (((xs, ys), zs), (rows, turns)) in chunks.zip(coordinates) {
-            find_coordinates(&self.azimuths, [xs, ys], [rows, turns]);
-            self.find_cells([xs, ys, zs, rows, turns], &mut cells, &mut keys);
-            for (&cell, &key) in cells.iter().zip(&keys).take(xs.len()) {
-                if key != NONE {
-                    self.cells[cell as usize].add_return(key);
-                }
-            }
-        }
-        self.coordinates = [rows, turns];
+        self.coordinates.iter_mut().for_each(|axis| axis.resize(sweep.x.len(), 0.0));
+        run_wide(SortPoints { cells: self, sweep });
     }
 
-    /// Computes cell and key of each point; [`NONE`] for a point that is left out. It has no branches and reads no
-    /// tables, so that the compiler vectorises it.
-    fn find_cells(&self, [xs, ys, zs, rows, turns]: [&[f32]; 5], cells: &mut [u32; CHUNK], keys: &mut [u32; CHUNK]) {
-        let n = xs.len().min(CHUNK);
-        let (xs, ys, zs, rows, turns) = (&xs[..n], &ys[..n], &zs[..n], &rows[..n], &turns[..n]);
-        let (cells, keys) = (&mut cells[..n], &mut keys[..n]);
-        let (least, most) = (RANGE_M_MIN * RANGE_M_MIN, RANGE_M_MAX * RANGE_M_MAX);
-        for i in 0..n {
-            let (x, y, z, row, turn) = (xs[i], ys[i], zs[i], rows[i], turns[i]);
-            let squared = x * x + y * y;
-            // NaN fails every comparison.
-            let inside = (squared >= least) & (squared < most) & (z * z <= 2.25 + 0.09 * squared);
-            // The row of a return right before the end of the last row is rounded up.
-            let inside = inside & (row < ROWS as f32) & !self.outline.contains(x, y);
-            let (whole_row, column) = (floor_to_whole(row), floor_to_whole(turn));
-            let along = floor_to_whole((row - whole_row as i32 as f32) * PLACES);
-            let across = floor_to_whole((turn - column as i32 as f32) * (PLACES - 1.0));
-            let height = floor_to_whole(((if inside { z } else { 0.0 }) + OFFSET_M) * 1000.0);
-            cells[i] = whole_row * COLUMNS as u32 + column;
-            keys[i] = if inside { height << 16 | along << 8 | across } else { NONE };
-        }
-    }
-
-    /// Row and column coordinate of each point of the sweep; see [`find_coordinates`].
+    /// Row and column coordinate of each point of the sweep; see [`coordinates`].
     pub fn point_coordinates(&self) -> [&[f32]; 2] {
         let [rows, turns] = &self.coordinates;
         [rows, turns]
@@ -149,24 +113,63 @@ impl PolarCells {
         if lowest == NONE { 0.0 } else { ((highest >> 16) as f32 - (lowest >> 16) as f32) * 1e-3 }
     }
 
-    /// Coordinates of a position; see [`find_coordinates`].
+    /// Coordinates of a position; see [`coordinates`].
     #[inline(always)]
     pub fn coordinates(&self, x: f32, y: f32) -> [f32; 2] {
         coordinates(&self.azimuths, x, y)
     }
 }
 
-/// Computes the coordinates of points: rows outward from [`RANGE_M_MIN`], columns counter-clockwise, both with a
-/// fraction. The row of a nearer point is 0, that of a farther one [`ROWS`]. It has no branches, so that the compiler
-/// vectorises it.
-fn find_coordinates(azimuths: &AzimuthColumns, [xs, ys]: [&[f32]; 2], [rows, turns]: [&mut [f32]; 2]) {
-    let n = xs.len();
-    let (ys, rows, turns) = (&ys[..n], &mut rows[..n], &mut turns[..n]);
-    for i in 0..n {
-        [rows[i], turns[i]] = coordinates(azimuths, xs[i], ys[i]);
+/// Finds the coordinates of each point of a sweep, and adds its return to its cell.
+struct SortPoints<'a> {
+    cells: &'a mut PolarCells,
+    sweep: &'a Sweep,
+}
+
+impl WideLoop for SortPoints<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let PolarCells { azimuths, outline, cells: returns, coordinates: [rows, turns] } = self.cells;
+        let (mut cells, mut keys) = ([0_u32; CHUNK], [NONE; CHUNK]);
+        let Sweep { x, y, z, .. } = self.sweep;
+        let chunks = x.chunks(CHUNK).zip(y.chunks(CHUNK)).zip(z.chunks(CHUNK));
+        for (((xs, ys), zs), (rows, turns)) in chunks.zip(rows.chunks_mut(CHUNK).zip(turns.chunks_mut(CHUNK))) {
+            let n = xs.len().min(CHUNK);
+            let (xs, ys, zs, rows, turns) = (&xs[..n], &ys[..n], &zs[..n], &mut rows[..n], &mut turns[..n]);
+            // Without a branch or a table, so that the compiler vectorises both.
+            for i in 0..n {
+                [rows[i], turns[i]] = coordinates(azimuths, xs[i], ys[i]);
+            }
+            for i in 0..n {
+                (cells[i], keys[i]) = cell_and_key(outline, [xs[i], ys[i], zs[i]], [rows[i], turns[i]]);
+            }
+            for (&cell, &key) in cells.iter().zip(&keys).take(n) {
+                if key != NONE {
+                    returns[cell as usize].add_return(key);
+                }
+            }
+        }
     }
 }
 
+/// Cell and key of a point with these coordinates; [`NONE`] for a point that is left out.
+#[inline(always)]
+fn cell_and_key(outline: &Outline, [x, y, z]: [f32; 3], [row, turn]: [f32; 2]) -> (u32, u32) {
+    let (least, most) = (RANGE_M_MIN * RANGE_M_MIN, RANGE_M_MAX * RANGE_M_MAX);
+    let squared = x * x + y * y;
+    // NaN fails every comparison.
+    let inside = (squared >= least) & (squared < most) & (z * z <= 2.25 + 0.09 * squared);
+    // The row of a return right before the end of the last row is rounded up.
+    let inside = inside & (row < ROWS as f32) & !outline.contains(x, y);
+    let (whole_row, column) = (floor_to_whole(row), floor_to_whole(turn));
+    let along = floor_to_whole((row - whole_row as i32 as f32) * PLACES);
+    let across = floor_to_whole((turn - column as i32 as f32) * (PLACES - 1.0));
+    let height = floor_to_whole(((if inside { z } else { 0.0 }) + OFFSET_M) * 1000.0);
+    (whole_row * COLUMNS as u32 + column, if inside { height << 16 | along << 8 | across } else { NONE })
+}
+
+/// Computes the coordinates of a position: rows outward from [`RANGE_M_MIN`], columns counter-clockwise, both with a
+/// fraction. The row of a nearer one is 0, that of a farther one [`ROWS`].
 #[inline(always)]
 fn coordinates(azimuths: &AzimuthColumns, x: f32, y: f32) -> [f32; 2] {
     let (least, most) = (RANGE_M_MIN * RANGE_M_MIN, RANGE_M_MAX * RANGE_M_MAX);

@@ -168,7 +168,7 @@ pub trait LayerMaker: CloneMaker + Send {
 
     /// The optional data of a scan this layer uses.
     fn uses(&self) -> ScanExtras {
-        ScanExtras { ground: true, ..ScanExtras::default() }
+        ScanExtras { ground: true, reached: true, ..ScanExtras::default() }
     }
 
     /// Adds the evidence of one sensor's scan. The pipeline calls it for each scan when the scan ends, in the order of

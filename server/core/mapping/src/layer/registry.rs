@@ -187,6 +187,7 @@ impl Layers {
         let active = self.layers.iter().filter_map(|layer| layer.active.as_ref());
         active.map(|active| active.maker.uses()).fold(ScanExtras::default(), |all, uses| ScanExtras {
             ground: all.ground || uses.ground,
+            reached: all.reached || uses.reached,
             deviations: all.deviations || uses.deviations,
             no_returns: all.no_returns || uses.no_returns,
         })

@@ -14,10 +14,13 @@
 
 pub mod config;
 
+use std::ops::{Range, RangeInclusive};
+
 use nalgebra::{Isometry3, Point3};
 
 use crate::azimuth_columns::{AzimuthColumns, floor_to_whole};
 use crate::sensor::sweep::Sweep;
+use crate::wide::{WideLoop, run_wide};
 
 use config::{GROUND_S_MAX, MemoryConfig, OBSTACLE_S_MAX, RANGE_M_MAX};
 
@@ -29,7 +32,7 @@ const SIDE: i64 = 256;
 /// Largest height of ground over or under the local ground, metres. Ours; not tuned.
 const GROUND_M_MAX: f32 = 0.2;
 /// Least and greatest height of an obstacle over the local ground, metres: those of the reach stage.
-const OBSTACLE_M: std::ops::RangeInclusive<f32> = 0.25..=2.5;
+const OBSTACLE_M: RangeInclusive<f32> = 0.25..=2.5;
 /// Greatest distance and turn between two poses, metres and radians, and how much more a second of time allows. Ours:
 /// no vehicle on wheels is faster.
 const JUMP_M: [f64; 2] = [1.0, 60.0];
@@ -69,12 +72,63 @@ struct MemoryCell {
     tall_m: f32,
 }
 
+impl MemoryCell {
+    /// Remembers ground at this height of the world, metres; the lowest of a map.
+    fn add_ground(&mut self, ground_m: f64, stamp_ns: i64) {
+        if self.ground_ns != stamp_ns || ground_m < self.ground_m {
+            (self.ground_m, self.ground_ns) = (ground_m, stamp_ns);
+        }
+    }
+
+    /// Removes what is too old, and ground that is older than an obstacle. Returns true if something is left.
+    fn expire(&mut self, stamp_ns: i64) -> bool {
+        let is_old = |since_ns: i64, s_max: f32| stamp_ns - since_ns > (f64::from(s_max) * NS_PER_S) as i64;
+        if self.obstacle_ns != 0 && self.ground_ns <= self.obstacle_ns || is_old(self.ground_ns, GROUND_S_MAX) {
+            self.ground_ns = 0;
+        }
+        if is_old(self.obstacle_ns, OBSTACLE_S_MAX) {
+            self.obstacle_ns = 0;
+        }
+        self.ground_ns != 0 || self.obstacle_ns != 0
+    }
+
+    /// The remembered point, ego frame, metres; `None` if it is out of the view of the newest map, or is no longer there.
+    fn recalled(
+        &self,
+        ego_from_map: &Isometry3<f64>,
+        view_m: &[f32; DIRECTIONS],
+        azimuths: &AzimuthColumns,
+    ) -> Option<[f32; 3]> {
+        let [x, y] = self.world.map(|world| (world as f64 + 0.5) * CELL_M);
+        let holds_obstacle = self.obstacle_ns != 0;
+        let at = |z: f64| (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
+        let point = at(if holds_obstacle { self.obstacle_m } else { self.ground_m });
+        let range_m = libm::hypotf(point.x, point.y);
+        let direction = azimuths.column(point.x, point.y) as usize;
+        let beside = [DIRECTIONS - 1, 0, 1].map(|beside| view_m[(direction + beside) % DIRECTIONS]);
+        let in_view = beside.into_iter().any(|view_m| VIEW * view_m >= range_m);
+        let is_tall = self.tall_m >= TALL_MIN * range_m && range_m >= TALL_RANGE_M_MIN;
+        let has_moved = holds_obstacle && is_tall && view_m[direction] >= range_m + BEHIND_M;
+        // Ground that is still there was seen after the obstacle.
+        let is_known = !has_moved || self.ground_ns != 0;
+        let point = if has_moved { at(self.ground_m) } else { point };
+        (range_m <= RANGE_M_MAX && in_view && is_known).then(|| [point.x, point.y, point.z])
+    }
+
+    /// Remembers an obstacle up to this height of the world that is this tall, metres; the highest of a map.
+    fn add_obstacle(&mut self, obstacle_m: f64, tall_m: f32, stamp_ns: i64) {
+        if self.obstacle_ns != stamp_ns || obstacle_m > self.obstacle_m {
+            (self.obstacle_m, self.tall_m, self.obstacle_ns) = (obstacle_m, tall_m, stamp_ns);
+        }
+    }
+}
+
 /// The memory of one vehicle.
 #[derive(Clone)]
 pub(crate) struct Memory {
     cells: Vec<MemoryCell>,
-    /// Indices of the cells that hold something.
-    listed: Vec<u32>,
+    /// One bit for each stored cell, set if it holds something, or held it when it was last asked for.
+    listed: Vec<u64>,
     /// Pose and stamp of the newest map; `None` without a pose.
     newest: Option<(Isometry3<f64>, i64)>,
     /// Points of the newest map and the remembered ones.
@@ -82,6 +136,9 @@ pub(crate) struct Memory {
     azimuths: AzimuthColumns,
     /// By point of the newest map's own: index of its stored cell, or [`NOWHERE`].
     places: Vec<u32>,
+    /// The points of the newest map's own that follow each other in one cell, and their stored cell. Neighbours of a ring
+    /// mostly share one.
+    runs: Vec<(u32, Range<usize>)>,
     /// One bit for each stored cell, set if the newest map has a point there.
     seen: Vec<u64>,
     /// What the newest map got.
@@ -102,11 +159,12 @@ impl Memory {
     pub fn new(config: &MemoryConfig) -> Option<Self> {
         config.enabled.then(|| Self {
             cells: vec![MemoryCell::default(); (SIDE * SIDE) as usize],
-            listed: Vec::new(),
+            listed: vec![0; (SIDE * SIDE / 64) as usize],
             newest: None,
             extended: Sweep::default(),
             azimuths: AzimuthColumns::new(AzimuthColumns::TWO_DEGREES),
             places: Vec::new(),
+            runs: Vec::new(),
             seen: vec![0; (SIDE * SIDE / 64) as usize],
             state: MemoryState::default(),
         })
@@ -131,8 +189,7 @@ impl Memory {
         self.state.points = 0;
         if let Some(pose) = map_from_ego {
             self.extended.copy_from(sweep);
-            self.expire(stamp_ns);
-            self.recall(pose);
+            self.recall(pose, stamp_ns);
             self.state.points = self.extended.x.len() - sweep.x.len();
         }
     }
@@ -140,96 +197,108 @@ impl Memory {
     /// Remembers the points of the newest map's own sweep, which have these heights over the ground.
     pub fn remember(&mut self, heights_m: &[f32]) {
         let Some((pose, stamp_ns)) = self.newest else { return };
-        let (places, sweep) = (std::mem::take(&mut self.places), std::mem::take(&mut self.extended));
+        let (runs, sweep) = (std::mem::take(&mut self.runs), std::mem::take(&mut self.extended));
         let (rotation, corner) = (pose.rotation.to_rotation_matrix(), corner(&pose));
         let up = [0, 1, 2].map(|i| rotation[(2, i)] as f32);
-        for (point, (&place, &height)) in places.iter().zip(heights_m).enumerate() {
-            let (is_ground, is_obstacle) = (height.abs() <= GROUND_M_MAX, OBSTACLE_M.contains(&height));
-            if place != NOWHERE && (is_ground || is_obstacle) {
-                let [x, y, z] = [sweep.x[point], sweep.y[point], sweep.z[point]];
-                let z_m = pose.translation.z + f64::from(up[0] * x + up[1] * y + up[2] * z);
-                let world = world_cell(corner, i64::from(place));
-                self.insert(place, world, z_m, is_obstacle.then_some(height), stamp_ns);
+        for (place, points) in &runs {
+            let (mut lowest_m, mut highest_m, mut tall_m) = (f32::INFINITY, f32::NEG_INFINITY, 0.0);
+            let [xs, ys, zs, heights_m] = [&sweep.x, &sweep.y, &sweep.z, heights_m].map(|axis| &axis[points.clone()]);
+            for (((x, y), z), &height_m) in xs.iter().zip(ys).zip(zs).zip(heights_m) {
+                let over_pose_m = up[0] * x + up[1] * y + up[2] * z;
+                // NaN fails every comparison.
+                if height_m.abs() <= GROUND_M_MAX {
+                    lowest_m = over_pose_m.min(lowest_m);
+                } else if OBSTACLE_M.contains(&height_m) && over_pose_m > highest_m {
+                    (highest_m, tall_m) = (over_pose_m, height_m);
+                }
+            }
+            let [lowest_m, highest_m] = [lowest_m, highest_m].map(|m| pose.translation.z + f64::from(m));
+            if lowest_m.is_finite() {
+                self.cell(*place, corner).add_ground(lowest_m, stamp_ns);
+            }
+            if highest_m.is_finite() {
+                self.cell(*place, corner).add_obstacle(highest_m, tall_m, stamp_ns);
             }
         }
-        (self.places, self.extended) = (places, sweep);
+        (self.runs, self.extended) = (runs, sweep);
     }
 
-    /// Remembers ground at this height in the world, or an obstacle there that has another height over the ground.
-    fn insert(&mut self, place: u32, world: [i64; 2], z_m: f64, obstacle: Option<f32>, stamp_ns: i64) {
-        let cell = &mut self.cells[place as usize];
-        if cell.ground_ns == 0 && cell.obstacle_ns == 0 {
-            self.listed.push(place);
-        }
+    /// The stored cell of a place of the square with this corner.
+    fn cell(&mut self, place: u32, corner: [i64; 2]) -> &mut MemoryCell {
+        let (world, cell) = (world_cell(corner, i64::from(place)), &mut self.cells[place as usize]);
+        self.listed[place as usize / 64] |= 1 << (place % 64);
         if cell.world != world {
             *cell = MemoryCell { world, ..MemoryCell::default() };
         }
-        if let Some(height_m) = obstacle {
-            if cell.obstacle_ns != stamp_ns || z_m > cell.obstacle_m {
-                (cell.obstacle_m, cell.tall_m) = (z_m, height_m);
-            }
-            cell.obstacle_ns = stamp_ns;
-        } else {
-            let is_lower = cell.ground_ns != stamp_ns || z_m < cell.ground_m;
-            cell.ground_m = if is_lower { z_m } else { cell.ground_m };
-            cell.ground_ns = stamp_ns;
-        }
-    }
-
-    /// Removes what is too old, and the ground of cells with a newer obstacle.
-    fn expire(&mut self, stamp_ns: i64) {
-        let [ground_ns, obstacle_ns] =
-            [GROUND_S_MAX, OBSTACLE_S_MAX].map(|seconds| (f64::from(seconds) * NS_PER_S) as i64);
-        let cells = &mut self.cells;
-        self.listed.retain(|index| {
-            let cell = &mut cells[*index as usize];
-            if cell.obstacle_ns != 0 && cell.ground_ns <= cell.obstacle_ns {
-                cell.ground_ns = 0;
-            }
-            if stamp_ns - cell.ground_ns > ground_ns {
-                cell.ground_ns = 0;
-            }
-            if stamp_ns - cell.obstacle_ns > obstacle_ns {
-                cell.obstacle_ns = 0;
-            }
-            cell.ground_ns != 0 || cell.obstacle_ns != 0
-        });
-        // The order in which cells were first seen follows the order of the points, which must not matter.
-        self.listed.sort_unstable();
+        cell
     }
 
     /// Adds a point for each remembered cell near the vehicle in which the map has no point itself.
-    fn recall(&mut self, map_from_ego: &Isometry3<f64>) {
+    fn recall(&mut self, map_from_ego: &Isometry3<f64>, stamp_ns: i64) {
         let ego_from_map = map_from_ego.inverse();
         self.find_seen_cells(map_from_ego);
         let view_m = self.view_m(&ego_from_map, map_from_ego);
-        for &index in &self.listed {
-            if self.seen[index as usize / 64] >> (index % 64) & 1 != 0 {
-                continue;
-            }
-            let cell = &self.cells[index as usize];
-            let [x, y] = cell.world.map(|world| (world as f64 + 0.5) * CELL_M);
-            let holds_obstacle = cell.obstacle_ns != 0;
-            let at = |z: f64| (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
-            let point = at(if holds_obstacle { cell.obstacle_m } else { cell.ground_m });
-            let range_m = libm::hypotf(point.x, point.y);
-            let direction = self.azimuths.column(point.x, point.y) as usize;
-            let beside = [DIRECTIONS - 1, 0, 1].map(|beside| view_m[(direction + beside) % DIRECTIONS]);
-            let in_view = beside.into_iter().any(|view_m| VIEW * view_m >= range_m);
-            let is_tall = cell.tall_m >= TALL_MIN * range_m && range_m >= TALL_RANGE_M_MIN;
-            let has_moved = holds_obstacle && is_tall && view_m[direction] >= range_m + BEHIND_M;
-            // Ground that is still there was seen after the obstacle.
-            let is_known = !has_moved || cell.ground_ns != 0;
-            if range_m <= RANGE_M_MAX && in_view && is_known {
-                let point = if has_moved { at(cell.ground_m) } else { point };
-                self.extended.push_remembered([point.x, point.y, point.z]);
+        for word in 0..self.listed.len() {
+            for index in bits(word, self.listed[word] & !self.seen[word]) {
+                if self.cells[index].expire(stamp_ns) {
+                    let point = self.cells[index].recalled(&ego_from_map, &view_m, &self.azimuths);
+                    point.into_iter().for_each(|point| self.extended.push_remembered(point));
+                } else {
+                    self.listed[word] &= !(1 << (index % 64));
+                }
             }
         }
     }
 
     /// Finds the stored cell of each point of the map, and those in which it has one.
     fn find_seen_cells(&mut self, map_from_ego: &Isometry3<f64>) {
-        let Self { places, seen, extended: Sweep { x: xs, y: ys, z: zs, .. }, .. } = self;
+        let Self { places, runs, seen, extended, .. } = self;
+        places.resize(extended.x.len(), NOWHERE);
+        run_wide(FindPlaces { map_from_ego, sweep: extended, places });
+        (seen.fill(0), runs.clear());
+        let mut first = 0;
+        for run in places.chunk_by(|place, next| place == next) {
+            if run[0] != NOWHERE {
+                seen[run[0] as usize / 64] |= 1 << (run[0] % 64);
+                runs.push((run[0], first..first + run.len()));
+            }
+            first += run.len();
+        }
+    }
+
+    /// By direction of two degrees: the range of the farthest point that the map has there, within the range of the
+    /// memory, metres; 0 without a point.
+    fn view_m(&self, ego_from_map: &Isometry3<f64>, map_from_ego: &Isometry3<f64>) -> [f32; DIRECTIONS] {
+        let (middle, corner) = (map_from_ego.translation.vector, corner(map_from_ego));
+        let mut view_m = [0f32; DIRECTIONS];
+        for index in self.seen.iter().enumerate().flat_map(|(word, seen)| bits(word, *seen)) {
+            let [x, y] = world_cell(corner, index as i64).map(|cell| (cell as f64 + 0.5) * CELL_M);
+            let point = (ego_from_map * Point3::new(x, y, middle.z)).cast::<f32>();
+            let farthest_m = &mut view_m[self.azimuths.column(point.x, point.y) as usize];
+            *farthest_m = farthest_m.max(libm::hypotf(point.x, point.y));
+        }
+        view_m
+    }
+
+    fn forget(&mut self) {
+        for (word, listed) in self.listed.iter_mut().enumerate() {
+            bits(word, std::mem::take(listed)).for_each(|index| self.cells[index] = MemoryCell::default());
+        }
+        self.state.drops += 1;
+    }
+}
+
+/// Writes the stored cell of each point of a sweep, or [`NOWHERE`].
+struct FindPlaces<'a> {
+    map_from_ego: &'a Isometry3<f64>,
+    sweep: &'a Sweep,
+    places: &'a mut [u32],
+}
+
+impl WideLoop for FindPlaces<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { map_from_ego, sweep: Sweep { x: xs, y: ys, z: zs, .. }, places } = self;
         let rotation = map_from_ego.rotation.to_rotation_matrix();
         let [across, along] = [0, 1].map(|axis| [0, 1, 2].map(|i| rotation[(axis, i)] as f32 * CELLS_A_M));
         let [(first_x, in_x), (first_y, in_y)] = [0, 1].map(|axis| {
@@ -237,7 +306,6 @@ impl Memory {
             let first = (cells.floor() as i64).rem_euclid(SIDE) as u32;
             (first, (cells - cells.floor()) as f32 + POSITIVE as f32)
         });
-        places.resize(xs.len(), NOWHERE);
         let n = places.len();
         let (xs, ys, zs) = (&xs[..n], &ys[..n], &zs[..n]);
         // Without a branch, so that the compiler vectorises it.
@@ -248,37 +316,16 @@ impl Memory {
             let place = cell_y % SIDE as u32 * SIDE as u32 + cell_x % SIDE as u32;
             places[i] = if x * x + y * y <= RANGE_M_MAX * RANGE_M_MAX { place } else { NOWHERE };
         }
-        seen.fill(0);
-        for place in places.iter().filter(|place| **place != NOWHERE) {
-            seen[*place as usize / 64] |= 1 << (place % 64);
-        }
     }
+}
 
-    /// By direction of two degrees: the range of the farthest point that the map has there, within the range of the
-    /// memory, metres; 0 without a point.
-    fn view_m(&self, ego_from_map: &Isometry3<f64>, map_from_ego: &Isometry3<f64>) -> [f32; DIRECTIONS] {
-        let (middle, corner) = (map_from_ego.translation.vector, corner(map_from_ego));
-        let mut view_m = [0f32; DIRECTIONS];
-        for (word, bits) in self.seen.iter().enumerate() {
-            let mut rest = *bits;
-            while rest != 0 {
-                let index = word as i64 * 64 + i64::from(rest.trailing_zeros());
-                rest &= rest - 1;
-                let [x, y] = world_cell(corner, index).map(|cell| (cell as f64 + 0.5) * CELL_M);
-                let point = (ego_from_map * Point3::new(x, y, middle.z)).cast::<f32>();
-                let farthest_m = &mut view_m[self.azimuths.column(point.x, point.y) as usize];
-                *farthest_m = farthest_m.max(libm::hypotf(point.x, point.y));
-            }
-        }
-        view_m
-    }
-
-    fn forget(&mut self) {
-        for index in self.listed.drain(..) {
-            self.cells[index as usize] = MemoryCell::default();
-        }
-        self.state.drops += 1;
-    }
+/// Index of each set bit of a word of bits, the lowest first.
+fn bits(word: usize, mut rest: u64) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let bit = (rest != 0).then(|| word * 64 + rest.trailing_zeros() as usize)?;
+        rest &= rest - 1;
+        Some(bit)
+    })
 }
 
 /// The first cell of the world, along x and y, of the square of stored cells about the vehicle.

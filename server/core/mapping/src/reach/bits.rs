@@ -157,11 +157,20 @@ impl Bits {
     pub fn flood(&mut self, open: &Self) {
         let rows = open.words.len() / open.stride;
         self.words.iter_mut().zip(&open.words).for_each(|(word, open)| *word = fill(*word, *open));
+        // Rows that have grown since they were last spread down, and up.
+        let [mut down, mut up] = [(); 2].map(|()| vec![true; rows]);
         loop {
             let mut grown = false;
             // Down and up; a path that turns back needs another round.
-            for (iy, from) in (1..rows).map(|iy| (iy, iy - 1)).chain((1..rows).rev().map(|iy| (iy - 1, iy))) {
-                grown |= self.spread(open, iy, from);
+            for iy in 1..rows {
+                if std::mem::take(&mut down[iy - 1]) && self.spread(open, iy, iy - 1) {
+                    (grown, down[iy], up[iy]) = (true, true, true);
+                }
+            }
+            for iy in (0..rows - 1).rev() {
+                if std::mem::take(&mut up[iy + 1]) && self.spread(open, iy, iy + 1) {
+                    (grown, down[iy], up[iy]) = (true, true, true);
+                }
             }
             if !grown {
                 break;

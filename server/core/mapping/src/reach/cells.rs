@@ -10,12 +10,6 @@ pub const SIDE: usize = 512;
 /// Cell of a point beyond the grid.
 pub const NOWHERE: u32 = u32::MAX;
 
-/// Writes the cell of each point, ego frame, metres; index = iy * [`SIDE`] + ix, or [`NOWHERE`]. It has no branches, so
-/// that the compiler vectorises it.
-pub fn find(xs: &[f32], ys: &[f32], cells: &mut [u32]) {
-    cells.iter_mut().zip(xs.iter().zip(ys)).for_each(|(found, (&x, &y))| *found = cell(x, y));
-}
-
 /// Index of the cell that contains a position; [`NOWHERE`] beyond the grid.
 #[inline(always)]
 pub fn cell(x: f32, y: f32) -> u32 {

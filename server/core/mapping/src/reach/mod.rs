@@ -29,11 +29,11 @@ pub(crate) mod flood;
 mod joins;
 mod obstacles;
 mod places;
+mod points;
 mod shadow;
 mod steps;
 mod troughs;
 
-use std::ops::Range;
 use std::sync::Arc;
 
 use crate::ground::Ground;
@@ -55,15 +55,8 @@ use shadow::Shadow;
 use steps::Steps;
 use troughs::Troughs;
 
-/// Number of points that are processed together. Ours: their cells fit into the first-level cache.
-const CHUNK: usize = 1024;
-
-/// Height over the ground below which a return shows the ground and its steps, metres. Ours: it is no obstacle to any
-/// vehicle; a higher one, whatever obstacles the vehicle drives over, is the side of a thing and no step.
-const GROUND_M_MAX: f32 = 0.25;
 /// Half the width of a shadow that is open, in cells. Ours: half a metre to each side.
 const CLOSING: usize = 2;
-
 /// Greatest width of the strip under the vehicle that is open without a return, metres. Ours: narrower than a car.
 const STRIP_M: f32 = 1.0;
 
@@ -193,14 +186,21 @@ impl Reach {
         &self.config
     }
 
-    /// Finds closed cells and reached ground. `ground` is that of `sweep`.
+    /// Finds closed cells and open ground. `ground` is that of `sweep`. What the vehicle reaches is old until
+    /// [`Self::flood`].
     pub fn update(&mut self, sweep: &Sweep, ground: &Ground) {
         let own = sweep.x.len() - sweep.remembered;
         self.obstacles.clear();
         self.steps.clear();
-        self.sort_points(sweep, ground.heights_m(), 0..own);
+        points::sort(sweep, ground.heights_m(), 0..own, &self.config, (&mut self.steps, &mut self.obstacles));
         self.seen_now.copy_from(self.steps.seen());
-        self.sort_points(sweep, ground.heights_m(), own..sweep.x.len());
+        points::sort(
+            sweep,
+            ground.heights_m(),
+            own..sweep.x.len(),
+            &self.config,
+            (&mut self.steps, &mut self.obstacles),
+        );
         self.closed.clear();
         let closed = &mut self.closed;
         let stepped = &mut self.stepped;
@@ -230,33 +230,13 @@ impl Reach {
             barred.set(cell % SIDE, cell / SIDE);
         }
         self.open_seen_ground(sweep.mount_height_m, ground.confidences());
+    }
+
+    /// Finds the ground that the vehicle reaches.
+    pub fn flood(&mut self) {
         let radius = self.disc_radius();
         self.flood.run(&self.open, &self.barred, radius, self.places.directions.near());
         self.places.directions.close(&self.open, &mut self.flood);
-    }
-
-    /// Sorts the points into those of obstacles and those of the ground; the vehicle's own obstacles are left out.
-    fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32], points: Range<usize>) {
-        let ReachConfig { obstacle_m_min, overhang_m, .. } = self.config;
-        let outline = self.config.outline();
-        let mut cells = [cells::NOWHERE; CHUNK];
-        let [xs, ys, zs, heights_m] =
-            [&sweep.x, &sweep.y, &sweep.z, heights_m].map(|axis| axis[points.clone()].chunks(CHUNK));
-        for (((xs, ys), zs), heights_m) in xs.zip(ys).zip(zs).zip(heights_m) {
-            cells::find(xs, ys, &mut cells);
-            for ((((&cell, &height), &x), &y), &z) in cells.iter().zip(heights_m).zip(xs).zip(ys).zip(zs) {
-                if cell == cells::NOWHERE {
-                    continue;
-                }
-                // NaN fails every comparison.
-                if height < GROUND_M_MAX {
-                    self.steps.add_point(cell, z, height);
-                }
-                if height >= obstacle_m_min && height <= overhang_m && !outline.contains(x, y) {
-                    self.obstacles.add_point(cell, height);
-                }
-            }
-        }
     }
 
     /// True if an obstacle stands in a cell, or a step of the ground ends there.

@@ -8,7 +8,7 @@ use super::cells::{CELL_M, SIDE};
 use super::config::STEP_SLOPE_MIN;
 
 /// Lowest height over the ground of a return that is used, metres. Ours: lower ones are mirror images.
-const LOWEST_M: f32 = -1.5;
+pub const LOWEST_M: f32 = -1.5;
 /// The cells that a cell is compared with: half of those within two cells, because each pair is compared once.
 const NEAR: [[isize; 2]; 10] = [[1, 0], [0, 1], [1, 1], [-1, 1], [2, 0], [0, 2], [2, 1], [1, 2], [-1, 2], [-2, 1]];
 /// Heights of a cell without a return.
@@ -35,16 +35,14 @@ impl Steps {
         self.seen.clear();
     }
 
-    /// Adds a return from the ground of a cell, at these heights in the ego frame and over the ground, metres.
+    /// Adds a return from the ground of a cell, at this height in the ego frame, millimetres.
     #[inline(always)]
-    pub fn add_point(&mut self, cell: u32, z_m: f32, height_m: f32) {
-        if height_m > LOWEST_M {
-            let span = &mut self.spans[cell as usize];
+    pub fn add_point(&mut self, cell: u32, millimetres: i16) {
+        let span = &mut self.spans[cell as usize];
+        if span[0] == i16::MAX {
             self.seen.set(cell as usize % SIDE, cell as usize / SIDE);
-            // Ground is within 20 m of the vehicle's height; the cast saturates.
-            let millimetres = (z_m * 1000.0) as i16;
-            *span = [span[0].min(millimetres), span[1].max(millimetres)];
         }
+        *span = [span[0].min(millimetres), span[1].max(millimetres)];
     }
 
     /// Calls `mark` with the higher and the lower cell of each step of at least this height, up to `near` cells from
@@ -112,8 +110,8 @@ mod tests {
             let least_m = 0.2_f32.max(0.5 * libm::hypotf(apart[0], apart[1]));
             for (height_m, expected) in [(least_m - 0.002, 0), (least_m + 0.002, 2)] {
                 let (mut steps, mut marked) = (Steps::new(), std::collections::BTreeSet::new());
-                steps.add_point(cell(5.1, 3.1), 0.0, 0.0);
-                steps.add_point(cell(5.1 + apart[0], 3.1 + apart[1]), height_m, 0.0);
+                steps.add_point(cell(5.1, 3.1), 0);
+                steps.add_point(cell(5.1 + apart[0], 3.1 + apart[1]), (height_m * 1000.0) as i16);
                 steps.find(0.2, SIDE / 2, |higher, lower| marked.extend([higher, lower]));
                 assert_eq!(marked.len(), expected, "{height_m} m high, {dx} and {dy} cells apart");
             }

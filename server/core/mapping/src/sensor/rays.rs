@@ -37,8 +37,10 @@ pub struct Rays<'a> {
 /// Optional data of a sensor's scan and of a map. The pipeline computes it only if an active layer uses it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ScanExtras {
-    /// The local ground and what the vehicle can reach (`Context::ground`, `Context::reach` of the layers).
+    /// The local ground and what closes it (`Context::ground`, `Context::reach` of the layers).
     pub ground: bool,
+    /// What the vehicle can reach on it ([`crate::reach::Reach::flood`]).
+    pub reached: bool,
     /// Range deviations of the distance series of all sensors ([`Sweep::deviation`]).
     pub deviations: bool,
     /// Directions of the rays without a return ([`Rays::no_returns`]).

@@ -16,6 +16,7 @@ use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{ScanKnots, knots};
 use crate::sensor::observation::{POSITION_M_MAX, Scan};
 use crate::sensor::self_filter::{FilterReason, RemovedPoints, SelfFilter};
+use crate::wide::{WideLoop, run_wide};
 
 /// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
 const CHUNK: usize = 1024;
@@ -242,24 +243,25 @@ impl Sweep {
             let (ys, zs) = (&ys[..n], &zs[..n]);
             let [ex, ey, ez] = &mut moved;
             let (ex, ey, ez, are_far) = (&mut ex[..n], &mut ey[..n], &mut ez[..n], &mut are_far[..n]);
-            // Without a branch, so that the compiler vectorises it.
-            let mut positions = 0_u32;
-            for i in 0..n {
-                let (is_position, is_return) = classify(xs[i], ys[i], zs[i]);
-                are_far[i] = is_return & is_far(mount, xs[i], ys[i], zs[i]);
-                (positions, returns) = (positions + u32::from(is_position), returns + u32::from(is_return));
-                [ex[i], ey[i], ez[i]] = at_rest.apply(xs[i], ys[i], zs[i]);
-            }
+            let (points, moved) = ([xs, ys, zs], [&mut *ex, &mut *ey, &mut *ez]);
+            let mut positions = 0;
+            let counts = [&mut positions, &mut returns];
+            run_wide(MoveAtRest { points, mount, transform: at_rest, moved, are_far: &mut *are_far, counts });
             removed.no_position += n as u64 - u64::from(positions);
             for i in (0..n).filter(|_| !moving.is_empty()) {
                 let (knot, share) = knots.position(scan.offset_ns[chunk * CHUNK + i]);
                 [ex[i], ey[i], ez[i]] = moving[knot].towards(&moving[knot + 1], share).apply(xs[i], ys[i], zs[i]);
             }
+            if let Some(check) = &check {
+                for (i, is_far) in are_far.iter_mut().enumerate().filter(|(_, is_far)| **is_far) {
+                    let reason = check([xs[i], ys[i], zs[i]]);
+                    removed.count(reason);
+                    *is_far = reason.is_none();
+                }
+            }
             for i in 0..n {
                 (self.x[kept], self.y[kept], self.z[kept]) = (ex[i], ey[i], ez[i]);
-                let reason = check.as_ref().and_then(|check| check([xs[i], ys[i], zs[i]])).filter(|_| are_far[i]);
-                removed.count(reason);
-                kept += usize::from(are_far[i] && reason.is_none());
+                kept += usize::from(are_far[i]);
             }
         }
         self.returns = returns;
@@ -345,6 +347,35 @@ impl Sweep {
         for axis in [&mut self.x, &mut self.y, &mut self.z] {
             axis.truncate(kept);
         }
+    }
+}
+
+/// Moves points by one transform, finds those that a sweep keeps, and counts the positions and the returns.
+struct MoveAtRest<'a> {
+    points: [&'a [f32]; 3],
+    mount: &'a Mount,
+    transform: Transform,
+    moved: [&'a mut [f32]; 3],
+    are_far: &'a mut [bool],
+    counts: [&'a mut u32; 2],
+}
+
+impl WideLoop for MoveAtRest<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { points: [xs, ys, zs], mount, transform, moved: [ex, ey, ez], are_far, counts } = self;
+        let n = are_far.len();
+        let (xs, ys, zs, ex, ey, ez) = (&xs[..n], &ys[..n], &zs[..n], &mut ex[..n], &mut ey[..n], &mut ez[..n]);
+        let [mut positions, mut returns] = [0; 2];
+        // Without a branch, so that the compiler vectorises it.
+        for i in 0..n {
+            let (is_position, is_return) = classify(xs[i], ys[i], zs[i]);
+            are_far[i] = is_return & is_far(mount, xs[i], ys[i], zs[i]);
+            (positions, returns) = (positions + u32::from(is_position), returns + u32::from(is_return));
+            [ex[i], ey[i], ez[i]] = transform.apply(xs[i], ys[i], zs[i]);
+        }
+        let [all_positions, all_returns] = counts;
+        (*all_positions, *all_returns) = (*all_positions + positions, *all_returns + returns);
     }
 }
 

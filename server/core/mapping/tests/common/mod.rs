@@ -241,6 +241,7 @@ pub fn shared_with(sweep: &Sweep, config: &ReachConfig) -> Shared {
     let (mut ground, mut reach) = (Ground::new(config.outline()), Reach::new(config));
     ground.estimate(sweep);
     reach.update(sweep, &ground);
+    reach.flood();
     Shared { ground, reach }
 }
 

@@ -134,9 +134,6 @@ impl Drops {
 
     fn mark(&mut self, reach: &Reach) {
         self.found.clear();
-        if self.spans.iter().all(|span| *span == 0) {
-            return;
-        }
         let agreed = |column: usize| {
             let [left, own, right] = [-1, 0, 1].map(|offset| self.spans[beside(column, offset)]);
             left & own | own & right | left & right
@@ -145,6 +142,9 @@ impl Drops {
         let wide =
             |column: usize| [-1, 0, 1].map(|offset| agreed(beside(column, offset))).into_iter().fold(0, |a, b| a | b);
         let spans: [u128; COLUMNS] = std::array::from_fn(wide);
+        if spans.iter().all(|span| *span == 0) {
+            return;
+        }
         let half = ((RANGE_M_MAX + GAP_M.end) / CELL_M) as usize;
         let near = SIDE / 2 - half..SIDE / 2 + half;
         for (ix, iy) in near.clone().flat_map(|iy| near.clone().map(move |ix| (ix, iy))) {

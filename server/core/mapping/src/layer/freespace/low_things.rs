@@ -13,6 +13,7 @@
 use crate::reach::Reach;
 use crate::reach::bits::Bits;
 use crate::reach::cells::{CELL_M, SIDE, cell, centre_m};
+use crate::wide::{WideLoop, run_wide};
 
 /// Number of cells along a side of the square in which low things are sought, in the middle of the grid: to 26 m.
 const WINDOW: usize = 208;
@@ -87,7 +88,7 @@ impl LowThings {
     /// Finds the low cells of the newest map: things, then steps.
     pub fn find(&mut self, reach: &Reach) -> [&Bits; 2] {
         self.copy_heights(reach);
-        self.score();
+        run_wide(Score(self));
         self.judge(reach);
         [&self.things, &self.steps]
     }
@@ -106,6 +107,7 @@ impl LowThings {
         }
     }
 
+    #[inline(always)]
     fn score(&mut self) {
         self.scores.fill(NONE);
         for SideBox { half, along, diagonal } in BOXES {
@@ -177,6 +179,15 @@ impl LowThings {
     }
 }
 
+struct Score<'a>(&'a mut LowThings);
+
+impl WideLoop for Score<'_> {
+    #[inline(always)]
+    fn run(self) {
+        self.0.score();
+    }
+}
+
 /// Writes the cells without a return right behind low ones.
 pub fn find_backs(reach: &Reach, low: &Bits, backs: &mut Bits) {
     backs.clear();
@@ -202,6 +213,8 @@ struct BoxSums {
     /// Sums along the rows.
     along: Vec<i32>,
     sums: Vec<i32>,
+    /// Of one row: the sum of all cells before each; as many as a box is wide are added beyond both ends.
+    before: Vec<i32>,
     /// One row.
     column_sums: Vec<i32>,
 }
@@ -209,18 +222,24 @@ struct BoxSums {
 impl BoxSums {
     fn new() -> Self {
         let zeros = vec![0; WINDOW * WINDOW];
-        Self { along: zeros.clone(), sums: zeros, column_sums: vec![0; WINDOW] }
+        Self { along: zeros.clone(), sums: zeros, before: Vec::new(), column_sums: vec![0; WINDOW] }
     }
 
     /// Replaces the sums by those of boxes of `2 * half + 1` cells a side.
+    #[inline(always)]
     fn add_up(&mut self, values: &[i32], half: usize) {
+        let (before, width) = (&mut self.before, 2 * half + 1);
+        before.resize(WINDOW + width, 0);
+        before[..=half].fill(0);
         for (row, sums) in values.chunks_exact(WINDOW).zip(self.along.chunks_exact_mut(WINDOW)) {
-            let mut sum: i32 = row[..half].iter().sum();
-            for ix in 0..WINDOW {
-                sum += row.get(ix + half).copied().unwrap_or(0);
-                sum -= if ix > half { row[ix - half - 1] } else { 0 };
-                sums[ix] = sum;
+            let mut sum = 0;
+            for (before, value) in before[half + 1..].iter_mut().zip(row) {
+                sum += value;
+                *before = sum;
             }
+            before[half + 1 + WINDOW..].fill(sum);
+            let ends = before[width..].iter().zip(&before[..WINDOW]);
+            sums.iter_mut().zip(ends).for_each(|(sum, (to, from))| *sum = to - from);
         }
         let row = |iy: usize| iy * WINDOW..(iy + 1) * WINDOW;
         self.column_sums.fill(0);

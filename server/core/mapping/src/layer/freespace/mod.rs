@@ -35,6 +35,7 @@ use crate::reach::bits::Bits;
 use crate::reach::cells::{CELL_M, SIDE, centre_m};
 use crate::reach::config::ReachConfig;
 use crate::reach::flood::Flood;
+use crate::sensor::rays::ScanExtras;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 
@@ -179,6 +180,11 @@ impl LayerMaker for Freespace {
         channels.extend(self.config.height.then(|| HEIGHT.empty()));
         channels.extend(self.config.why.then(|| WHY.empty()));
         Layer::new("freespace", Self::geometry(), FreespaceClass::LEGEND, channels)
+    }
+
+    /// It floods the ground itself.
+    fn uses(&self) -> ScanExtras {
+        ScanExtras { ground: true, ..ScanExtras::default() }
     }
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {

@@ -348,6 +348,7 @@ mod tests {
         }
         ground.estimate(&sweep);
         reach.update(&sweep, &ground);
+        reach.flood();
         let mut space = FreeSpace::new(160, 0.25);
         space.states.fill(State::Obstacle);
         space.add_obstacles(&Context { reach: Some(&reach), ..Context::default() });

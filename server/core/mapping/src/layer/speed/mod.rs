@@ -197,7 +197,7 @@ impl LayerMaker for Speed {
     }
 
     fn uses(&self) -> ScanExtras {
-        ScanExtras { ground: true, deviations: true, ..ScanExtras::default() }
+        ScanExtras { ground: true, reached: true, deviations: true, ..ScanExtras::default() }
     }
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
