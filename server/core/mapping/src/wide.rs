@@ -28,3 +28,34 @@ pub(crate) fn run_wide(work: impl WideLoop) {
 
     Arch::new().dispatch(Wide(work));
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Sums with a root and a choice, as the loops of the stages have them.
+    struct Mix<'a> {
+        from: &'a [f32],
+        to: &'a mut [f32],
+    }
+
+    impl WideLoop for Mix<'_> {
+        #[inline(always)]
+        fn run(self) {
+            for (to, x) in self.to.iter_mut().zip(self.from) {
+                let squared = x * x + 0.1 * x + 0.3;
+                *to = if squared > 2.0 { squared.sqrt() / 3.0 } else { squared * 0.7 - x };
+            }
+        }
+    }
+
+    #[test]
+    fn a_wide_loop_gives_the_bytes_of_the_plain_one() {
+        let from: Vec<f32> = (0..1003).map(|i| (i as f32 - 500.0) * 0.0137).chain([f32::NAN, f32::INFINITY]).collect();
+        let [mut wide, mut plain] = [(); 2].map(|()| vec![0.0; from.len()]);
+        run_wide(Mix { from: &from, to: &mut wide });
+        Mix { from: &from, to: &mut plain }.run();
+        let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+        assert_eq!(bits(&wide), bits(&plain));
+    }
+}

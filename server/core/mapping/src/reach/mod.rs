@@ -144,6 +144,8 @@ pub struct Reach {
     /// Closed cells, those between two cells beside a step, and those on the continuation of an edge.
     barred: Bits,
     flood: Flood,
+    /// The cells with a closed one among the 5 x 5 cells around each.
+    near_closed: Bits,
 }
 
 impl Reach {
@@ -176,8 +178,9 @@ impl Reach {
             joins: Joins::new(),
             blind_zone: BlindZone::new(),
             edges: Edges::new(),
-            barred: bits,
+            barred: bits.clone(),
             flood: Flood::new(SIDE),
+            near_closed: bits,
         }
     }
 
@@ -234,6 +237,8 @@ impl Reach {
 
     /// Finds the ground that the vehicle reaches.
     pub fn flood(&mut self) {
+        self.dilated.grow(&self.closed, &mut self.wide);
+        self.near_closed.grow(&self.dilated, &mut self.wide);
         let radius = self.disc_radius();
         self.flood.run(&self.open, &self.barred, radius, self.places.directions.near());
         self.places.directions.close(&self.open, &mut self.flood);
@@ -250,8 +255,7 @@ impl Reach {
     pub fn is_open_ground(&self, cell: ReachCell) -> bool {
         let Some(cell) = cell.index().filter(|cell| self.steps.low_mm(*cell) != i16::MAX) else { return false };
         let (ix, iy) = (cell % SIDE, cell / SIDE);
-        let near = |index: usize| index.saturating_sub(2)..(index + 3).min(SIDE);
-        self.flood.is_reached(ix, iy) && !near(iy).any(|iy| near(ix).any(|ix| self.closed.get(ix, iy)))
+        self.flood.is_reached(ix, iy) && !self.near_closed.get(ix, iy)
     }
 
     /// True if the vehicle can get to a cell: if the disc covers it somewhere on its path.

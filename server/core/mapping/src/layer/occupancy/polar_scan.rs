@@ -23,6 +23,7 @@
 
 use crate::azimuth_columns::{floor_to_whole, round_to_whole};
 use crate::sensor::rays::Rays;
+use crate::wide::{WideLoop, run_wide};
 
 use super::azimuth_bins::{AzimuthBins, BINS, around, neighbour};
 use super::bits::{any_bit, bits_of_word, set_bits};
@@ -208,7 +209,7 @@ impl PolarScan {
         let origin = [rays.origin_m[0], rays.origin_m[1], rays.origin_height_m];
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(rays.heights_m.chunks(CHUNK));
         for ((xs, ys), zs) in chunks {
-            chunk.fill([xs, ys, zs], origin, config, azimuths);
+            run_wide(FillChunk { chunk: &mut chunk, points: [xs, ys, zs], origin_m: origin, config, azimuths });
             for (i, ((&x, &y), &z)) in xs.iter().zip(ys).zip(zs).enumerate() {
                 let (bin, range) = (chunk.bin[i] as usize, chunk.range[i]);
                 self.present[bin] = true;
@@ -383,6 +384,22 @@ impl Chunk {
             under_of[i] = round_to_whole(least(under, least(range, steps)));
             low_of[i] = round_to_whole(least(low, least(range, steps)));
         }
+    }
+}
+
+/// [`Chunk::fill`] as a loop.
+struct FillChunk<'a> {
+    chunk: &'a mut Chunk,
+    points: [&'a [f32]; 3],
+    origin_m: [f32; 3],
+    config: &'a OccupancyConfig,
+    azimuths: &'a AzimuthBins,
+}
+
+impl WideLoop for FillChunk<'_> {
+    #[inline(always)]
+    fn run(self) {
+        self.chunk.fill(self.points, self.origin_m, self.config, self.azimuths);
     }
 }
 

@@ -15,6 +15,7 @@ use crate::azimuth_columns::floor_to_whole;
 use crate::layer::maker::Context;
 use crate::layer::roughness::NOWHERE;
 use crate::sensor::sweep::Sweep;
+use crate::wide::{WideLoop, run_wide};
 
 use super::config::{GRADE_MAX, STEP_M_MAX, SpeedConfig};
 use super::rough_ground::RoughGround;
@@ -125,12 +126,13 @@ impl HeightMap {
         let heights_m = context.heights_m(sweep).chunks(CHUNK);
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
         for (((xs, ys), zs), heights) in chunks.zip(heights_m) {
-            self.find_cells(
-                [xs, ys, zs, heights],
-                lowest_m..=config.overhang_m,
-                &mut cells,
-                [&mut millimetres, &mut over_ground],
-            );
+            run_wide(FindCells {
+                map: self,
+                points: [xs, ys, zs, heights],
+                used_m: [lowest_m, config.overhang_m],
+                cells: &mut cells,
+                heights_mm: [&mut millimetres, &mut over_ground],
+            });
             rough_ground.add_points(&cells, deviations.next().unwrap_or_default());
             for ((&cell, &millimetres), &over_ground) in cells.iter().zip(&millimetres).zip(&over_ground).take(xs.len())
             {
@@ -144,37 +146,6 @@ impl HeightMap {
                     sums.add_point([millimetres as i16, over_ground as i16]);
                 }
             }
-        }
-    }
-
-    /// Finds the cell of each point up to the largest height, and its heights if it is not too low. It has no branches
-    /// and reads no tables, so that the compiler vectorises it.
-    fn find_cells(
-        &self,
-        [xs, ys, zs, heights]: [&[f32]; 4],
-        used_m: std::ops::RangeInclusive<f32>,
-        cells: &mut [u32; CHUNK],
-        [millimetres, over_ground]: [&mut [i32; CHUNK]; 2],
-    ) {
-        let (middle, cells_a_m, side) = ((self.side / 2) as f32, 1.0 / self.cell_m, self.side as f32);
-        let (lowest_m, highest_m) = (*used_m.start(), *used_m.end());
-        let n = xs.len().min(CHUNK);
-        let (xs, ys, zs, heights) = (&xs[..n], &ys[..n], &zs[..n], &heights[..n]);
-        let (cells, millimetres, over_ground) = (&mut cells[..n], &mut millimetres[..n], &mut over_ground[..n]);
-        for i in 0..n {
-            let (ix, iy) = (xs[i] * cells_a_m + middle, ys[i] * cells_a_m + middle);
-            let (z, height) = (zs[i], heights[i]);
-            // NaN fails every comparison.
-            let within = (ix >= 0.0) & (ix < side) & (iy >= 0.0) & (iy < side);
-            let inside = within & (height <= highest_m);
-            let is_used = inside & (height > lowest_m) & (z.abs() < HEIGHT_M_MAX);
-            let [ix, iy] = [ix, iy].map(|index| floor_to_whole(if inside { index } else { 0.0 }));
-            let [z, height] = [z * 1000.0 + OFFSET_MM, height * 1000.0 + OFFSET_MM]
-                .map(|value| floor_to_whole(if is_used { value } else { 0.0 }));
-            cells[i] = if inside { iy * self.side as u32 + ix } else { NOWHERE };
-            // The value is positive before the cast, so that the cast rounds.
-            millimetres[i] = z as i32 - OFFSET_MM as i32;
-            over_ground[i] = if is_used { height as i32 - OFFSET_MM as i32 } else { NOT_USED };
         }
     }
 
@@ -231,6 +202,46 @@ impl HeightMap {
 fn around(ix: usize, iy: usize, side: usize) -> impl Iterator<Item = usize> {
     let near = move |i: usize| i.saturating_sub(1)..(i + 2).min(side);
     near(iy).flat_map(move |y| near(ix).map(move |x| y * side + x))
+}
+
+/// Finds the cell of each point up to the largest height, and its heights if it is not too low. It has no branches and
+/// reads no tables, so that the compiler vectorises it.
+struct FindCells<'a> {
+    map: &'a HeightMap,
+    /// x, y and z, and the heights over the ground.
+    points: [&'a [f32]; 4],
+    /// The heights over the ground between which a point is used.
+    used_m: [f32; 2],
+    cells: &'a mut [u32; CHUNK],
+    /// z, and the heights over the ground.
+    heights_mm: [&'a mut [i32; CHUNK]; 2],
+}
+
+impl WideLoop for FindCells<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { map, points: [xs, ys, zs, heights], used_m, cells, heights_mm: [millimetres, over_ground] } = self;
+        let (middle, cells_a_m, side) = ((map.side / 2) as f32, 1.0 / map.cell_m, map.side as f32);
+        let [lowest_m, highest_m] = used_m;
+        let n = xs.len().min(CHUNK);
+        let (xs, ys, zs, heights) = (&xs[..n], &ys[..n], &zs[..n], &heights[..n]);
+        let (cells, millimetres, over_ground) = (&mut cells[..n], &mut millimetres[..n], &mut over_ground[..n]);
+        for i in 0..n {
+            let (ix, iy) = (xs[i] * cells_a_m + middle, ys[i] * cells_a_m + middle);
+            let (z, height) = (zs[i], heights[i]);
+            // NaN fails every comparison.
+            let within = (ix >= 0.0) & (ix < side) & (iy >= 0.0) & (iy < side);
+            let inside = within & (height <= highest_m);
+            let is_used = inside & (height > lowest_m) & (z.abs() < HEIGHT_M_MAX);
+            let [ix, iy] = [ix, iy].map(|index| floor_to_whole(if inside { index } else { 0.0 }));
+            let [z, height] = [z * 1000.0 + OFFSET_MM, height * 1000.0 + OFFSET_MM]
+                .map(|value| floor_to_whole(if is_used { value } else { 0.0 }));
+            cells[i] = if inside { iy * map.side as u32 + ix } else { NOWHERE };
+            // The value is positive before the cast, so that the cast rounds.
+            millimetres[i] = z as i32 - OFFSET_MM as i32;
+            over_ground[i] = if is_used { height as i32 - OFFSET_MM as i32 } else { NOT_USED };
+        }
+    }
 }
 
 #[cfg(test)]
