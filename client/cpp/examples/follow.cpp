@@ -12,7 +12,7 @@ int main(int count, char** arguments) {
     wanted.layers = {"freespace"};
     wanted.deltas = wanted.reconnects = true;
     clearway::MapStream maps(count > 1 ? arguments[1] : "localhost:50051", wanted);
-    const clearway::Outline car{3.6, 1.0, 1.8};
+    const clearway::Outline car{3.0, 2.0, 2.0};
     try {
         while (true) {
             const auto map = maps.next();

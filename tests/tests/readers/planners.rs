@@ -22,7 +22,7 @@ use crate::fixture::venv::{self, run};
 use crate::fixture::within;
 
 const LAYER: &str = "freespace";
-const CAR: Outline = Outline { front_m: 3.6, rear_m: 1.0, width_m: 1.8 };
+const CAR: Outline = Outline { front_m: 3.0, rear_m: 2.0, width_m: 2.0 };
 /// Longest wait for an answer, so that a test that hangs ends.
 const PATIENCE: Duration = Duration::from_secs(120);
 

@@ -210,7 +210,8 @@ impl Engine {
         // The status comes before the map too, so that a reader of the map finds it counted.
         self.update_status();
         if let Some(encoded) = encoded {
-            let total = duration(now_ns().saturating_sub(encoded.capture_end_ns));
+            // A map that is made again for a reader was not on its way since its capture.
+            let total = waited.and_then(|_| duration(now_ns().saturating_sub(encoded.capture_end_ns)));
             let stages = StageTimes { receive: waited, map: Some(computed), encode: Some(encoding), total };
             self.publish_map(encoded, states, speed_m_s, stages);
         }

@@ -52,16 +52,25 @@ pub struct LayerSubscription {
 impl LayerSubscription {
     /// True if `map` has all layers of the subscription.
     pub fn is_covered_by(&self, map: &EncodedMap) -> bool {
-        let is_in_map = |index: &usize| map.layers.iter().any(|(name, _)| *name == self.all.0[*index].0);
-        self.indices.iter().all(is_in_map)
+        self.indices.iter().all(|index| self.is_in(map, *index))
     }
 
-    /// Waits for the newest map with all layers of the subscription. `None` if the engine stops, or if no such map
-    /// comes within [`LAYER_TIMEOUT`].
+    fn is_in(&self, map: &EncodedMap, index: usize) -> bool {
+        map.layers.iter().any(|(name, _)| *name == self.all.0[index].0)
+    }
+
+    /// Waits for the newest map with all layers of the subscription. If none comes within [`LAYER_TIMEOUT`], because no
+    /// data arrives, it is the newest one with some of them; `None` if that has none, or if the engine stops.
     pub async fn newest_map(&self, newest: &watch::Receiver<Newest>) -> Newest {
-        let mut newest = newest.clone();
-        let covering = newest.wait_for(|map| map.as_ref().is_some_and(|map| self.is_covered_by(map)));
-        tokio::time::timeout(LAYER_TIMEOUT, covering).await.ok()?.ok()?.clone()
+        let mut waiting = newest.clone();
+        let covering = waiting.wait_for(|map| map.as_ref().is_some_and(|map| self.is_covered_by(map)));
+        match tokio::time::timeout(LAYER_TIMEOUT, covering).await {
+            Ok(covering) => covering.ok()?.clone(),
+            Err(_) => {
+                let newest = newest.borrow().clone();
+                newest.filter(|map| self.indices.iter().any(|index| self.is_in(map, *index)))
+            }
+        }
     }
 }
 

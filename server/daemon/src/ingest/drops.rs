@@ -88,6 +88,10 @@ impl DropCounters {
         let mut senders = locked(&self.unknown_senders);
         let known = senders.iter().position(|sender| sender.address == address);
         let known = known.and_then(|index| senders.remove(index));
+        // One line: anybody can send from many addresses.
+        if senders.is_empty() && known.is_none() {
+            tracing::warn!(%address, "datagrams of a sender that vehicle.udp.from does not name are refused");
+        }
         if known.is_none() && senders.len() == UNKNOWN_SENDERS_MAX {
             senders.pop_front();
         }

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use clearway_proto::v1;
 
-use clearway_journal::encode::Replayed;
+use clearway_journal::encode::{Replayed, lag_ns};
 
 /// When events of recorded time are due, and how far their stamps are from the present. It starts at the first event
 /// that it is asked about. A pause stops it, also between two events; [`ReplayClock::restart`] begins elsewhere.
@@ -19,7 +19,7 @@ pub struct ReplayClock {
 }
 
 /// Time by which the stamps of a drive are behind the arrivals of its events, in ns, because its sensor followed
-/// another clock than its host. It is followed in whole [`LAG_STEP_NS`], as soon as it is less, and after
+/// another clock than its host: the [`lag_ns`] of its first map. It is followed as soon as it is less, and after
 /// [`LATE_MAPS_MAX`] maps if it is more: maps that were late on the way of the drive are late as live too.
 #[derive(Debug, Default)]
 struct StampLag {
@@ -27,19 +27,16 @@ struct StampLag {
     late_maps: u32,
 }
 
-/// Smallest lag that is followed, in ns. Ours: a third of the validity of a map.
-const LAG_STEP_NS: i64 = 100_000_000;
 /// Number of maps in a row after which a greater lag is a clock's. Ours: one second.
 const LATE_MAPS_MAX: u32 = 10;
 
 impl StampLag {
     /// Adds the lag of a map.
     fn add(&mut self, map_ns: i64) {
-        let steps_ns = if map_ns.abs() < LAG_STEP_NS { 0 } else { map_ns.div_euclid(LAG_STEP_NS) * LAG_STEP_NS };
-        let is_late = self.ns.is_some_and(|ns| steps_ns > ns);
+        let is_late = self.ns.is_some_and(|ns| map_ns > ns);
         self.late_maps = if is_late { self.late_maps + 1 } else { 0 };
         if !is_late || self.late_maps >= LATE_MAPS_MAX {
-            (self.ns, self.late_maps) = (Some(steps_ns), 0);
+            (self.ns, self.late_maps) = (Some(map_ns), 0);
         }
     }
 }
@@ -94,7 +91,7 @@ impl ReplayClock {
 
     /// Notes that the event of the recorded time `at_ns` has made a map whose capture ended at `capture_end_ns`.
     pub fn note_map(&mut self, at_ns: i64, capture_end_ns: i64) {
-        self.lag.add(at_ns.saturating_sub(capture_end_ns));
+        self.lag.add(lag_ns(at_ns, capture_end_ns));
     }
 
     /// The header that a map of the recorded time `at_ns` is served with; `None` for the recorded map's own. As live
@@ -105,7 +102,8 @@ impl ReplayClock {
             false => 0,
         };
         let boot_id = boot_id.wrapping_add(state.jumps);
-        (state.as_live || state.jumps > 0).then_some(Replayed { shift_ns, boot_id })
+        let first_at_ns = (state.as_live && self.lag.ns.is_none()).then_some(at_ns);
+        (state.as_live || state.jumps > 0).then_some(Replayed { shift_ns, boot_id, first_at_ns })
     }
 
     /// What is added to a stamp of the event's time to move it to the time at which the event is due: one constant at
@@ -143,12 +141,13 @@ mod tests {
         let (mut clock, state) = (ReplayClock::new(1.0), v1::ReplayState { as_live: true, ..Default::default() });
         let mut map = |at: i64, behind: i64| {
             clock.due(at * MS, 0);
-            let shift_ns = clock.replayed(&state, 0, at * MS, 0).expect("stamps of its own").shift_ns;
+            let Replayed { shift_ns, first_at_ns, .. } = clock.replayed(&state, 0, at * MS, 0).expect("its own stamps");
+            let shift_ns = shift_ns + first_at_ns.map_or(0, |at_ns| lag_ns(at_ns, (at - behind) * MS));
             clock.note_map(at * MS, (at - behind) * MS);
             // The drive began at 1000 ms, which is 0 of this machine.
             (at - 1_000) - ((at - behind) + shift_ns / MS)
         };
-        assert_eq!(map(1_000, 950), 950, "nothing is known before the first map");
+        assert_eq!(map(1_000, 950), 50, "the first map shows it");
         assert_eq!([map(1_100, 955), map(1_200, 930), map(1_300, 1_400)], [55, 30, 500], "one map was late");
         assert_eq!([map(1_400, -450), map(1_500, -450)], [-1_350, 50], "stamps of the future are followed at once");
         let ages: Vec<_> = (0..12).map(|n| map(1_600 + 100 * n, 20)).collect();

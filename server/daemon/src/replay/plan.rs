@@ -128,7 +128,7 @@ fn plan_several(options: &ReplayOptions, recordings: Vec<Recorded>, bytes: u64) 
             }
         }
     }
-    known.config = overridden(known.config, options, &options.files[0])?;
+    known.config = overridden(known.config, options, &options.files[0], &mut known.tables)?;
     let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
     let setup = known.setup(options)?;
     let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
@@ -359,20 +359,41 @@ fn configured(options: &ReplayOptions, recorded: Option<&Path>) -> Result<KnownV
             let (mut config, mut tables) = run_config(&recording)?;
             pick(file, &mut config, &mut tables)?;
             // The publishers, the files and the recorder of the recorded run are not those of this run.
-            let config = overridden(Config { vehicles: config.vehicles, ..Config::default() }, options, file)?;
+            let config = Config { vehicles: config.vehicles, ..Config::default() };
+            let config = overridden(config, options, file, &mut tables)?;
             return Ok(known(config, tables, Some(recording.header().boot_id), true));
         }
     }
-    let config = overridden(Config::of_one_vehicle("car", "top"), options, &options.files[0])?;
-    Ok(known(config, vec![vec![None]], None, false))
+    let mut tables = vec![vec![None]];
+    let config = overridden(Config::of_one_vehicle("car", "top"), options, &options.files[0], &mut tables)?;
+    // A key of the extrinsics says that they are known.
+    let is_mounted = options.set.iter().any(|key| key.contains(".extrinsics."));
+    Ok(known(config, tables, None, is_mounted))
 }
 
-/// A configuration with the overrides of the options.
-fn overridden(config: Config, options: &ReplayOptions, recording: &Path) -> Result<Config, ReplayError> {
-    match &options.set[..] {
-        [] => Ok(config),
-        set => Ok(Config::parse(&config.to_toml(), recording, set)?),
+/// A configuration with the overrides of the options; the calibration tables that they name replace those in `tables`.
+fn overridden(
+    config: Config,
+    options: &ReplayOptions,
+    recording: &Path,
+    tables: &mut Calibrations,
+) -> Result<Config, ReplayError> {
+    if options.set.is_empty() {
+        return Ok(config);
     }
+    let overridden = Config::parse(&config.to_toml(), recording, &options.set)?;
+    let sensors = |config: &Config| config.vehicles.iter().flat_map(|v| v.sensors.clone()).collect::<Vec<_>>();
+    let mut named = overridden.clone();
+    let own = named.vehicles.iter_mut().flat_map(|vehicle| &mut vehicle.sensors);
+    // The table of a recorded run is in its recording, whatever its file was called then.
+    own.zip(sensors(&config))
+        .filter(|(own, was)| own.calibration == was.calibration)
+        .for_each(|(own, _)| own.calibration = None);
+    let named = named.calibrations(recording)?;
+    for (table, named) in tables.iter_mut().flatten().zip(named.into_iter().flatten()) {
+        *table = named.or(table.take());
+    }
+    Ok(overridden)
 }
 
 /// The points of the first revolutions or scans, in the sensor frame, in metres.

@@ -16,6 +16,7 @@ use super::message::server_name;
 use super::vehicle::{Changing, VehicleStatus, packet_counts};
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
+use crate::ingest::drops::UnknownSender;
 
 /// Interval at which the vehicles are assessed. Ours: short beside the time in which a person or a probe reacts.
 const ASSESS_PERIOD: Duration = Duration::from_millis(200);
@@ -142,7 +143,10 @@ impl VehicleStatus {
         let of_sensors =
             changing.counts.sensors.iter().map(|sensor| sensor_facts(sensor, senders(sensor.source), &changing, up));
         let sensors = of_sensors.collect();
+        let is_recent = |sender: &UnknownSender| now_ns() - sender.newest_ns <= SILENT_AFTER.as_nanos() as i64;
+        let unknown_senders = self.drops.unknown_senders().into_iter().filter(is_recent);
         Facts {
+            unknown_senders: unknown_senders.map(|sender| sender.address.to_string()).collect(),
             fault: self.fault(),
             up,
             makes_maps: !self.layers.is_empty(),

@@ -76,6 +76,8 @@ pub struct Facts {
     pub replay_awaited: String,
     /// The sensors.
     pub sensors: Vec<SensorFacts>,
+    /// The addresses that sent datagrams in the last seconds and are none of the vehicle's sensors.
+    pub unknown_senders: Vec<String>,
     /// Share of the packets of the last 10 s that were lost or refused, 0 to 1; `None` if none was expected.
     pub loss: Option<f64>,
     /// What is wrong with the recording.
@@ -186,6 +188,10 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
     }
     if let Some(loss) = facts.loss.filter(|_| is_lossy) {
         add(State::Warn, format!("{:.1} % of the packets of the last 10 s were lost or refused", 100.0 * loss));
+    }
+    if !facts.unknown_senders.is_empty() {
+        let senders = facts.unknown_senders.join(", ");
+        add(State::Warn, format!("datagrams of {senders} are refused: vehicle.udp.from names other senders"));
     }
     if let Some(problem) = &facts.recorder_problem {
         add(State::Warn, format!("recorder: {problem}"));

@@ -14,4 +14,4 @@ pub use event::{
     EventDecodeError, ego_pose_from_proto, event_from_bytes, event_to_proto, road_from_proto, scan_from_proto,
     sensor_from_proto,
 };
-pub use map::{EncodedMap, Replayed, as_served, as_served_with, meaning, sensor};
+pub use map::{EncodedMap, Replayed, as_served, as_served_with, lag_ns, meaning, sensor};

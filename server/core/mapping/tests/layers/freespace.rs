@@ -35,6 +35,12 @@ fn is_own(cell: usize) -> bool {
     ReachConfig::default().outline().contains(x, y)
 }
 
+/// True for the cells that the outline touches.
+fn is_touched(cell: usize) -> bool {
+    let [x, y] = centre(cell);
+    ReachConfig::default().outline().grown_by(0.126).contains(x, y)
+}
+
 fn is_free(layer: &Layer, cell: usize) -> bool {
     layer.legend[usize::from(classes(layer)[cell])].meaning == Meaning::Free
 }
@@ -57,7 +63,7 @@ fn count(layer: &Layer, class: FreespaceClass, x_m: [f32; 2], y_m: [f32; 2]) -> 
 fn without_points_all_but_the_vehicle_is_unknown() {
     let layer = freespace(&empty(Model::Hdl64eS2));
     for (cell, class) in classes(&layer).iter().enumerate() {
-        let expected = if is_own(cell) { FreespaceClass::Vehicle } else { FreespaceClass::Unknown };
+        let expected = if is_touched(cell) { FreespaceClass::Vehicle } else { FreespaceClass::Unknown };
         assert_eq!(*class, expected.value(), "{:?}", centre(cell));
     }
 }
@@ -285,7 +291,7 @@ fn the_sector_of_a_covered_sensor_is_never_free() {
             }
         }
         let layer = freespace(&sweep);
-        for cell in (0..classes(&layer).len()).filter(|cell| is_free(&layer, *cell) && !is_own(*cell)) {
+        for cell in (0..classes(&layer).len()).filter(|cell| is_free(&layer, *cell) && !is_touched(*cell)) {
             let [x, y] = centre(cell);
             let range_m = libm::hypotf(x, y);
             // The directions of the ground's estimate are two degrees wide; the blind zone has none.

@@ -39,7 +39,10 @@ fn nothing_is_wrong_with_fresh_maps_of_whole_scans() {
 #[test]
 fn each_thing_that_is_wrong_has_its_words() {
     type Change = fn(&mut Facts);
-    let cases: [(&str, &str, Change); 23] = [
+    let cases: [(&str, &str, Change); 24] = [
+        ("warn", "datagrams of 127.0.0.1:9 are refused: vehicle.udp.from names other senders", |f| {
+            f.unknown_senders = vec!["127.0.0.1:9".to_owned()];
+        }),
         ("error", "the engine has hung for 4 s", |f| f.fault = Some("the engine has hung for 4 s".into())),
         ("warn", "no packets from rear for 76 s", |f| f.sensors[1].silent = Some(ms(76_000))),
         ("warn", "no packets from rear since the server started 60 s ago", |f| f.sensors[1].silent = None),

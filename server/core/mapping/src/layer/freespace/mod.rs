@@ -51,6 +51,8 @@ use unproved::Unproved;
 /// Distance to the vehicle's outline within which nothing is low and no drop is found, metres. Ours: the returns of the
 /// vehicle's own sides.
 const OWN_M: f32 = 0.5;
+/// Distance below which an outline touches a cell, metres: more than the rounding errors of a centre.
+const ROUNDING_M: f32 = 1e-3;
 
 /// Maker of the layer `freespace`. It reuses its buffers.
 #[derive(Clone)]
@@ -69,9 +71,11 @@ pub struct Freespace {
     /// The cells that only a step closes; those of them that are free.
     stepped: Bits,
     released: Bits,
-    /// The outline whose cells are known, the cells in it, and the cells in it and around it.
+    /// The outline whose cells are known, the cells with their centres in it, the other cells that it touches, and the
+    /// cells in it and around it.
     outline: Outline,
     vehicle: Vec<usize>,
+    touched: Vec<usize>,
     own: Bits,
 }
 
@@ -95,6 +99,7 @@ impl Freespace {
             released: bits.clone(),
             outline: ReachConfig::default().outline(),
             vehicle: Vec::new(),
+            touched: Vec::new(),
             own: bits,
         };
         freespace.set_outline(freespace.outline);
@@ -108,8 +113,9 @@ impl Freespace {
     fn set_outline(&mut self, outline: Outline) {
         self.outline = outline;
         self.vehicle.clear();
+        self.touched.clear();
         self.own.clear();
-        let wide = outline.grown_by(OWN_M);
+        let (wide, touching) = (outline.grown_by(OWN_M), outline.grown_by(CELL_M / 2.0 + ROUNDING_M));
         for cell in 0..SIDE * SIDE {
             let [x, y] = centre_m(cell);
             if wide.contains(x, y) {
@@ -117,6 +123,8 @@ impl Freespace {
             }
             if outline.contains(x, y) {
                 self.vehicle.push(cell);
+            } else if touching.contains(x, y) {
+                self.touched.push(cell);
             }
         }
     }
@@ -209,6 +217,14 @@ impl LayerMaker for Freespace {
             }
         }
         self.vehicle.iter().for_each(|cell| class[*cell] = FreespaceClass::Vehicle.value());
+        // No ray shows that nothing stands in the rest of a cell that the vehicle fills in part; it stands there itself.
+        let unseen =
+            [FreespaceClass::Unknown, FreespaceClass::Hidden, FreespaceClass::NotReached].map(|unseen| unseen.value());
+        for cell in &self.touched {
+            if unseen.contains(&class[*cell]) {
+                class[*cell] = FreespaceClass::Vehicle.value();
+            }
+        }
         layer.geometry = Self::geometry();
         layer.clear_lists();
         let free = count_cells(&class, FreespaceClass::Free.value());
