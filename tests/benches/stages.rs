@@ -14,6 +14,8 @@
 //! | maps | a scan event -> a map of all six layers | |
 //! | shared | a scan -> its points, their ground and reach: what all layers have in common | |
 //! | freespace | a scan event -> the bytes of `freespace`, when nothing else is wanted | |
+//! | freespace_of_packets | the datagrams of a revolution -> the bytes of `freespace` | |
+//! | maps_of_packets | the datagrams of a revolution -> the bytes of six layers | |
 //! | encode | a map of six layers -> the bytes of each, with all channels | the runs of six grids of 160,000 cells |
 //!
 //! The first rounds, in which buffers get their sizes, are not counted.
@@ -66,6 +68,9 @@ struct StagesArguments {
     /// Rounds of the table.
     #[arg(long, default_value_t = 30)]
     rounds: u32,
+    /// Writes the scan to this file in KITTI's format, and ends.
+    #[arg(long)]
+    write: Option<PathBuf>,
     /// Prints the names of the stages on one line; then reads names, one a line, runs each once, and answers each with
     /// its nanoseconds.
     #[arg(long)]
@@ -78,6 +83,13 @@ struct StagesArguments {
 fn main() {
     let arguments = StagesArguments::parse();
     let mut stages = Stages::new(&arguments);
+    if let Some(file) = &arguments.write {
+        let Scan { x, y, z, intensity, .. } = &stages.scan;
+        let points = x.iter().zip(y).zip(z).zip(intensity);
+        let bytes = points.flat_map(|(((x, y), z), i)| [x, y, z, i].map(|value| value.to_le_bytes())).flatten();
+        std::fs::write(file, bytes.collect::<Vec<_>>()).expect("a file that can be written");
+        return;
+    }
     if arguments.ask {
         println!("{}", Stages::NAMES.join(" "));
         for name in stdin().lock().lines().map_while(Result::ok) {
@@ -130,6 +142,7 @@ struct Stages {
     scan: Scan,
     /// A pipeline for each stage that makes maps, by name.
     pipelines: BTreeMap<&'static str, Pipeline>,
+    of_packets: BTreeMap<&'static str, OfPackets>,
     six_units: SixUnits,
     shared: Shared,
     floor: Floor,
@@ -138,7 +151,7 @@ struct Stages {
 }
 
 impl Stages {
-    const NAMES: [&'static str; 12] = [
+    const NAMES: [&'static str; 14] = [
         "decode",
         "drivability",
         "height_difference",
@@ -150,6 +163,8 @@ impl Stages {
         "shared",
         "maps",
         "freespace",
+        "freespace_of_packets",
+        "maps_of_packets",
         "encode",
     ];
 
@@ -175,6 +190,9 @@ impl Stages {
             datagrams: datagrams.map(|datagram| datagram.payload.into()).collect(),
             decoder: Sensor::new(LidarConfig { model: Some(Model::Hdl64eS2), ..LidarConfig::default() }),
             pipelines: of_maps.map(|stage| (stage, pipeline(height_m, &layers_of(stage)))).collect(),
+            of_packets: [("freespace_of_packets", &["freespace"][..]), ("maps_of_packets", &LAYERS)]
+                .map(|(stage, layers)| (stage, OfPackets { vehicle: vehicle.clone(), pipeline: pipeline(1.9, layers) }))
+                .into(),
             six_units: SixUnits::new(),
             shared: Shared::new(height_m),
             floor: Floor::new(&scan),
@@ -200,6 +218,7 @@ impl Stages {
             }),
             "occupancy_six_units" => timed(|| self.six_units.run()),
             "shared" => timed(|| self.shared.run(&self.scan)),
+            name if let Some(stage) = self.of_packets.get_mut(name) => stage.run(),
             _ => {
                 let pipeline = self.pipelines.get_mut(name).unwrap_or_else(|| panic!("{name} is no stage"));
                 let event = |body| Event { sequence: 0, arrival_ns: stamp_ns, source: 0, body };
@@ -240,6 +259,34 @@ fn pipeline(height_m: f64, layers: &[&str]) -> Pipeline {
     let mut pipeline = Pipeline::new(&config, vec![None]).expect("the default configuration");
     pipeline.set_active_layers(|layer| layers.contains(&layer));
     pipeline
+}
+
+/// The stream of a simulated sensor, and a pipeline that makes maps of it.
+struct OfPackets {
+    vehicle: SimulatedVehicle,
+    pipeline: Pipeline,
+}
+
+impl OfPackets {
+    /// Makes and encodes the map of the next revolution.
+    fn run(&mut self) -> Duration {
+        let mut events = Vec::new();
+        let mut end_ns = None;
+        for datagram in self.vehicle.by_ref() {
+            let arrival_ns = datagram.stamp_ns;
+            events.push(Event { sequence: 0, arrival_ns, source: 0, body: Body::Datagram(datagram.payload.into()) });
+            if arrival_ns >= *end_ns.get_or_insert(arrival_ns + PERIOD_NS) {
+                break;
+            }
+        }
+        timed(|| {
+            for event in &events {
+                if let Ok(Some(map)) = self.pipeline.step(event) {
+                    black_box(EncodedMap::new(map, "car".into(), 1, 300));
+                }
+            }
+        })
+    }
 }
 
 /// What all layers have in common: a scan's points, and once for each map their ground and reach.

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .errors import ClearwayError
 from .grid import CartesianGrid, Grid, RadialGrid
-from .shapes import Arc, Outline, Point, corners_of, finite, length, poses_of
+from .shapes import Arc, Outline, Point, Pose, corners_of, finite, length, poses_of
 
 #: Distance in metres below which a point touches a cell: far more than the rounding errors of a point on a map.
 _TOUCH_M = 1e-9
@@ -92,7 +93,9 @@ class Asked:
         outline.check()
         poses = poses_of(path)
         low: tuple[float, Blocker] | None = None
-        for pose in poses:
+        for pose, is_free in zip(poses, self._surely_free(poses, outline)):
+            if is_free:
+                continue
             answer = self._answer(outline.at(pose.place, pose.heading_rad), pose.place)
             if answer.blocker is None:
                 continue
@@ -126,15 +129,58 @@ class Asked:
         kinds = self._kinds[self._classes].reshape(height, width)
         free = (kinds == FREE) | (passes_low & (kinds == LOW))
         reach = min(math.ceil(most_m / self._grid.cell_m + 0.5), height + width)
-        down = _steps_down(free, reach)
-        squared = np.full((height, width), np.iinfo(np.int64).max)
-        for by in range(min(reach, width) + 1):
+        down = _halves(_steps_down(free, reach))
+        squared = down.copy()
+        for by in range(1, min(reach, width) + 1):
             away = _halves(np.int64(by))
-            padded = np.zeros((height, width + 2 * by), dtype=np.int64)
-            padded[:, by : by + width] = _halves(down)
-            for shifted in (padded[:, :width], padded[:, 2 * by :]):
-                np.minimum(squared, shifted + away, out=squared)
+            if away >= squared.max():
+                break
+            for here, there in ((np.s_[:, by:], np.s_[:, :-by]), (np.s_[:, :-by], np.s_[:, by:])):
+                np.minimum(squared[here], down[there] + away, out=squared[here])
+            # Outside the grid nothing is free.
+            for border in (squared[:, :by], squared[:, width - by :]):
+                np.minimum(border, away, out=border)
         return np.minimum(np.sqrt(squared.astype(np.float64)) * (self._grid.cell_m / 2.0), most_m)
+
+    def _surely_free(self, poses: Sequence[Pose], outline: Outline) -> np.ndarray:
+        """By pose: true if every cell of a few upright boxes is free which together cover the outline there. That
+        is found for all poses at once; a pose for which it is false may be free too."""
+        grid = self._grid
+        if not isinstance(grid, CartesianGrid):
+            return np.zeros(len(poses), dtype=bool)
+        length_m = outline.front_m + outline.rear_m
+        parts = max(1, min(8, math.ceil(length_m / max(outline.width_m, 0.1))))
+        x = np.linspace(-outline.rear_m, outline.front_m, parts + 1)[:, None]
+        y = np.array([-outline.width_m / 2.0, outline.width_m / 2.0])
+        heading = np.array([pose.heading_rad for pose in poses])[:, None, None]
+        place = np.array([pose.place for pose in poses])
+        ego_x = place[:, 0, None, None] + x * np.cos(heading) - y * np.sin(heading)
+        ego_y = place[:, 1, None, None] + x * np.sin(heading) + y * np.cos(heading)
+        sin, cos = math.sin(grid.yaw_rad), math.cos(grid.yaw_rad)
+        u = (ego_x * cos - ego_y * sin - grid.origin_x_m) / grid.cell_m
+        v = (ego_x * sin + ego_y * cos - grid.origin_y_m) / grid.cell_m
+        slack = 10.0 * _TOUCH_M / grid.cell_m
+        # Each part lies between two of the lines across the outline.
+        first = [np.minimum(of.min(axis=2)[:, :-1], of.min(axis=2)[:, 1:]) for of in (u, v)]
+        last = [np.maximum(of.max(axis=2)[:, :-1], of.max(axis=2)[:, 1:]) for of in (u, v)]
+        # A place far outside has no cell number.
+        most = grid.width + grid.height
+        left, low = (np.floor(of - slack).clip(-1, most).astype(np.int64) for of in first)
+        right, high = (np.floor(of + slack).clip(-1, most).astype(np.int64) + 1 for of in last)
+        is_inside = (left >= 0) & (low >= 0) & (right <= grid.width) & (high <= grid.height)
+        before = self._others_before
+        left, right, low, high = (np.where(is_inside, of, 0) for of in (left, right, low, high))
+        others = before[high, right] - before[low, right] - before[high, left] + before[low, left]
+        are_free: np.ndarray = (is_inside & (others == 0)).all(axis=1)
+        return are_free
+
+    @cached_property
+    def _others_before(self) -> np.ndarray:
+        """For each corner of the cells: how many cells that are not free lie in rows and columns before it."""
+        height, width = self._grid.shape
+        before = np.zeros((height + 1, width + 1), dtype=np.int64)
+        before[1:, 1:] = (self._kinds != FREE)[self._classes].reshape(height, width).cumsum(0).cumsum(1)
+        return before
 
     def _answer(self, corners: list[Point], start: Point) -> Answer:
         cells, outside = touched(self._grid, corners)
