@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`options`] | what a replay does |
 //! | `plan` | options, files -> configuration, mount, readings |
+//! | `overrides` | configuration, keys of the command line -> configuration, calibration tables |
 //! | `bag` | topics of a ROS 2 bag -> sensors and their mounts |
 //! | `recordings` | files -> recordings of several vehicles; sensors that do not fit |
 //! | `ready_file` | the running server -> the file that tells programs its addresses |
@@ -36,6 +37,7 @@ use crate::status::VehicleStatus;
 mod bag;
 pub mod error;
 pub mod options;
+mod overrides;
 mod plan;
 mod ready_file;
 mod recordings;

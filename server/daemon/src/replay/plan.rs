@@ -18,6 +18,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use super::bag::{choice, extrinsics_of, frames_of, keep_placed, sensors_of};
 use super::error::ReplayError;
 use super::options::ReplayOptions;
+use super::overrides::overridden;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
 use crate::config::{Calibrations, Config, Origin, Recorder, Ros};
@@ -369,31 +370,6 @@ fn configured(options: &ReplayOptions, recorded: Option<&Path>) -> Result<KnownV
     // A key of the extrinsics says that they are known.
     let is_mounted = options.set.iter().any(|key| key.contains(".extrinsics."));
     Ok(known(config, tables, None, is_mounted))
-}
-
-/// A configuration with the overrides of the options; the calibration tables that they name replace those in `tables`.
-fn overridden(
-    config: Config,
-    options: &ReplayOptions,
-    recording: &Path,
-    tables: &mut Calibrations,
-) -> Result<Config, ReplayError> {
-    if options.set.is_empty() {
-        return Ok(config);
-    }
-    let overridden = Config::parse(&config.to_toml(), recording, &options.set)?;
-    let sensors = |config: &Config| config.vehicles.iter().flat_map(|v| v.sensors.clone()).collect::<Vec<_>>();
-    let mut named = overridden.clone();
-    let own = named.vehicles.iter_mut().flat_map(|vehicle| &mut vehicle.sensors);
-    // The table of a recorded run is in its recording, whatever its file was called then.
-    own.zip(sensors(&config))
-        .filter(|(own, was)| own.calibration == was.calibration)
-        .for_each(|(own, _)| own.calibration = None);
-    let named = named.calibrations(recording)?;
-    for (table, named) in tables.iter_mut().flatten().zip(named.into_iter().flatten()) {
-        *table = named.or(table.take());
-    }
-    Ok(overridden)
 }
 
 /// The points of the first revolutions or scans, in the sensor frame, in metres.

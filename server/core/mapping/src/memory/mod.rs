@@ -12,6 +12,7 @@
 //!   in another direction than from the sensor.
 //! - Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
 
+mod cell;
 pub mod config;
 
 use std::ops::{Range, RangeInclusive};
@@ -22,10 +23,9 @@ use crate::azimuth_columns::{AzimuthColumns, floor_to_whole};
 use crate::sensor::sweep::Sweep;
 use crate::wide::{WideLoop, run_wide};
 
-use config::{GROUND_S_MAX, MemoryConfig, OBSTACLE_S_MAX, RANGE_M_MAX};
+use cell::{CELL_M, DIRECTIONS, MemoryCell, NS_PER_S};
+use config::{MemoryConfig, RANGE_M_MAX};
 
-/// Side of a cell, metres. Ours: the cells of the reach stage.
-const CELL_M: f64 = 0.25;
 const CELLS_A_M: f32 = (1.0 / CELL_M) as f32;
 /// Number of stored cells along a side, a power of two: 64 m.
 const SIDE: i64 = 256;
@@ -37,91 +37,10 @@ const OBSTACLE_M: RangeInclusive<f32> = 0.25..=2.5;
 /// no vehicle on wheels is faster.
 const JUMP_M: [f64; 2] = [1.0, 60.0];
 const JUMP_RAD: [f64; 2] = [0.2, 3.0];
-const NS_PER_S: f64 = 1e9;
-/// Nothing is remembered beyond this many times the range of the farthest return of the newest map in that direction.
-/// Ours: the rings of 16 lasers on flat ground are at 7, 8, 11, 15, 21 and 38 m.
-const VIEW: f32 = 2.0;
-/// Least height over the ground, as a share of its range, and least range, metres, of an obstacle that is forgotten if
-/// the newest map has no point in it, but one behind it. Ours: the lasers of a VLP-16 are 2 degrees apart, so that one
-/// meets it if it still stands there.
-const TALL_MIN: f32 = 0.035;
-const TALL_RANGE_M_MIN: f32 = 5.0;
-/// Least distance of the point behind it, metres. Ours: a car is longer.
-const BEHIND_M: f32 = 1.0;
 /// A place that is farther away than [`RANGE_M_MAX`].
 const NOWHERE: u32 = u32::MAX;
 /// Number of cells that make each offset from the vehicle's cell positive: a multiple of [`SIDE`].
 const POSITIVE: u32 = 1024;
-/// Number of directions in which the map may have no return.
-const DIRECTIONS: usize = AzimuthColumns::TWO_DEGREES as usize;
-
-/// What one cell of the world holds.
-#[derive(Clone, Copy, Debug, Default)]
-struct MemoryCell {
-    /// World index (x, y) of the cell that is stored here.
-    world: [i64; 2],
-    /// Height of the lowest ground of the newest map that saw it, world frame, metres.
-    ground_m: f64,
-    /// Stamp of that map, ns; 0 without ground.
-    ground_ns: i64,
-    /// Height of the highest obstacle of the newest map that saw one, world frame, metres.
-    obstacle_m: f64,
-    /// Stamp of that map, ns; 0 without an obstacle.
-    obstacle_ns: i64,
-    /// Height of that obstacle over the ground, metres.
-    tall_m: f32,
-}
-
-impl MemoryCell {
-    /// Remembers ground at this height of the world, metres; the lowest of a map.
-    fn add_ground(&mut self, ground_m: f64, stamp_ns: i64) {
-        if self.ground_ns != stamp_ns || ground_m < self.ground_m {
-            (self.ground_m, self.ground_ns) = (ground_m, stamp_ns);
-        }
-    }
-
-    /// Removes what is too old, and ground that is older than an obstacle. Returns true if something is left.
-    fn expire(&mut self, stamp_ns: i64) -> bool {
-        let is_old = |since_ns: i64, s_max: f32| stamp_ns - since_ns > (f64::from(s_max) * NS_PER_S) as i64;
-        if self.obstacle_ns != 0 && self.ground_ns <= self.obstacle_ns || is_old(self.ground_ns, GROUND_S_MAX) {
-            self.ground_ns = 0;
-        }
-        if is_old(self.obstacle_ns, OBSTACLE_S_MAX) {
-            self.obstacle_ns = 0;
-        }
-        self.ground_ns != 0 || self.obstacle_ns != 0
-    }
-
-    /// The remembered point, ego frame, metres; `None` if it is out of the view of the newest map, or is no longer there.
-    fn recalled(
-        &self,
-        ego_from_map: &Isometry3<f64>,
-        view_m: &[f32; DIRECTIONS],
-        azimuths: &AzimuthColumns,
-    ) -> Option<[f32; 3]> {
-        let [x, y] = self.world.map(|world| (world as f64 + 0.5) * CELL_M);
-        let holds_obstacle = self.obstacle_ns != 0;
-        let at = |z: f64| (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
-        let point = at(if holds_obstacle { self.obstacle_m } else { self.ground_m });
-        let range_m = libm::hypotf(point.x, point.y);
-        let direction = azimuths.column(point.x, point.y) as usize;
-        let beside = [DIRECTIONS - 1, 0, 1].map(|beside| view_m[(direction + beside) % DIRECTIONS]);
-        let in_view = beside.into_iter().any(|view_m| VIEW * view_m >= range_m);
-        let is_tall = self.tall_m >= TALL_MIN * range_m && range_m >= TALL_RANGE_M_MIN;
-        let has_moved = holds_obstacle && is_tall && view_m[direction] >= range_m + BEHIND_M;
-        // Ground that is still there was seen after the obstacle.
-        let is_known = !has_moved || self.ground_ns != 0;
-        let point = if has_moved { at(self.ground_m) } else { point };
-        (range_m <= RANGE_M_MAX && in_view && is_known).then(|| [point.x, point.y, point.z])
-    }
-
-    /// Remembers an obstacle up to this height of the world that is this tall, metres; the highest of a map.
-    fn add_obstacle(&mut self, obstacle_m: f64, tall_m: f32, stamp_ns: i64) {
-        if self.obstacle_ns != stamp_ns || obstacle_m > self.obstacle_m {
-            (self.obstacle_m, self.tall_m, self.obstacle_ns) = (obstacle_m, tall_m, stamp_ns);
-        }
-    }
-}
 
 /// The memory of one vehicle.
 #[derive(Clone)]
@@ -353,6 +272,8 @@ fn continues((newest, newest_ns): (Isometry3<f64>, i64), map_from_ego: Option<&I
 
 #[cfg(test)]
 mod tests {
+    use super::cell::TALL_RANGE_M_MIN;
+    use super::config::{GROUND_S_MAX, OBSTACLE_S_MAX};
     use super::*;
 
     /// Seconds after the first map.

@@ -7,6 +7,7 @@
 //! | [`motion`] | ego poses, speed + revolution -> how the ego frame moved through it; steps of clocks |
 //! | [`self_filter`] | return -> the reason to remove it, if it does not belong to the surroundings |
 //! | [`sweep`] | revolution or scan + mount -> [`sweep::Sweep`] in the ego frame |
+//! | `transform` | point -> the same point in another frame |
 //! | [`deviation`] | deviation of a range -> whole number |
 //! | [`distance_series`] | revolution -> how far each range deviates from its laser's neighbouring ranges |
 //! | [`ring_series`] | scan with rings -> the same for each of its points |
@@ -32,3 +33,4 @@ pub(crate) mod scan;
 pub mod self_filter;
 pub(crate) mod state;
 pub mod sweep;
+mod transform;

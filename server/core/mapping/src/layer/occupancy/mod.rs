@@ -32,6 +32,7 @@
 
 mod azimuth_bins;
 mod bits;
+mod chunk;
 pub mod class;
 pub mod config;
 pub mod flicker;
