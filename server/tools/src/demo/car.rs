@@ -24,7 +24,7 @@ use clearway_daemon::engine::newest::Newest;
 /// A car that drives until it is stopped.
 pub struct DemoCar {
     sensors: Vec<JoinHandle<std::io::Result<Sent>>>,
-    observer: Option<JoinHandle<Result<(), ClientError>>>,
+    observer: JoinHandle<Result<(), ClientError>>,
     /// The time that each sensor, and the observations, skipped.
     skipped: Vec<Skipped>,
     halt: Arc<AtomicBool>,
@@ -36,12 +36,13 @@ pub fn address(index: usize) -> Ipv4Addr {
 }
 
 impl DemoCar {
-    /// Starts the car. Datagrams go to `data` and `telemetry`; if the rig has plane units, their scans, poses and roads
-    /// go to `grpc`. The car waits for a server whose `newest` map is late.
+    /// Starts the car of this name. Datagrams go to `data` and `telemetry`, observations to `grpc`. The car waits for a
+    /// server whose `newest` map is late.
     ///
     /// # Errors
     /// The operating system's error if it starts no thread.
     pub fn start(
+        name: &str,
         rig: Rig,
         (data, telemetry): (SocketAddr, SocketAddr),
         grpc: SocketAddr,
@@ -53,13 +54,11 @@ impl DemoCar {
             skipped.push(Skipped::default());
             skipped.last().cloned().unwrap_or_default()
         };
-        let observer = if rig.units.is_empty() {
-            None
-        } else {
+        let observer = {
             let (rig, halt, skipped, progress) = (rig.clone(), halt.clone(), new_skipped(), progress(newest));
-            let runtime = tokio::runtime::Handle::current();
-            let observe = move || runtime.block_on(observe(rig, grpc, halt, progress, skipped));
-            Some(std::thread::Builder::new().name("simulated car".into()).spawn(observe)?)
+            let (runtime, name) = (tokio::runtime::Handle::current(), name.to_owned());
+            let observe = move || runtime.block_on(observe(&name, rig, grpc, halt, progress, skipped));
+            std::thread::Builder::new().name("simulated car".into()).spawn(observe)?
         };
         let several = rig.scanners.len() > 1;
         let mut start = |(index, (name, _)): (usize, &(String, _))| {
@@ -77,7 +76,7 @@ impl DemoCar {
 
     /// True if a part of the car has ended by itself, which is a fault.
     pub fn has_stopped(&self) -> bool {
-        self.sensors.iter().any(JoinHandle::is_finished) || self.observer.as_ref().is_some_and(JoinHandle::is_finished)
+        self.sensors.iter().any(JoinHandle::is_finished) || self.observer.is_finished()
     }
 
     /// Simulated time skipped so far, because the machine is too slow: that of the sensor that skipped most.
@@ -96,12 +95,9 @@ impl DemoCar {
         let ended = tokio::task::spawn_blocking(move || -> Result<Sent> {
             let mut sum = Sent::default();
             for sensor in sensors {
-                let sent = sensor.join().map_err(|_| panicked())??;
-                sum.packets += sent.packets;
-                sum.telemetry += sent.telemetry;
-                sum.device_time = sum.device_time.max(sent.device_time);
+                sum += sensor.join().map_err(|_| panicked())??;
             }
-            observer.map_or(Ok(Ok(())), JoinHandle::join).map_err(|_| panicked())??;
+            observer.join().map_err(|_| panicked())??;
             Ok(sum)
         });
         ended.await.map_err(std::io::Error::other)?.context("the simulated car")
@@ -116,13 +112,14 @@ fn progress(newest: &watch::Receiver<Newest>) -> impl Fn() -> Progress + Send + 
 
 /// Sends each observation at the time of its stamp. Scans that are too late are skipped, not simulated.
 async fn observe(
+    name: &str,
     rig: Rig,
     grpc: SocketAddr,
     halt: Arc<AtomicBool>,
     progress: impl Fn() -> Progress,
     skipped: Skipped,
 ) -> Result<(), ClientError> {
-    let mut ingester = Client::connect(&grpc.to_string()).await?.ingest("car").await?;
+    let mut ingester = Client::connect(&grpc.to_string()).await?.ingest(name).await?;
     let mut observations = rig.observations();
     let mut sent_ns = None;
     while !halt.load(Ordering::Relaxed) {
