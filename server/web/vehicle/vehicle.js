@@ -71,6 +71,8 @@ export class VehicleView {
         if (!at) this.#writeCell(null);
       },
     });
+    // A phone shows two lines of them.
+    $("reasons").onclick = () => $("reasons").classList.toggle("whole");
     $("zoom-in").onclick = () => shown().zoom(1.5);
     $("zoom-out").onclick = () => shown().zoom(1 / 1.5);
     $("zoom-all").onclick = () => shown().reset();

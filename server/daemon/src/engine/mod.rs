@@ -262,8 +262,8 @@ impl Engine {
         self.wires.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
     }
 
-    /// Makes the pipeline compute the layers that have subscribers. While it records maps it computes all layers, because
-    /// a replay does not have the readers of the recorded run.
+    /// Makes the pipeline compute the layers that have subscribers. While maps are recorded it computes all layers,
+    /// because a replay does not have the readers of the recorded run.
     fn update_layers(&mut self) {
         let all = self.recording.as_ref().is_some_and(RecordingHandle::records_maps);
         let subscriptions = &self.wires.subscriptions;
