@@ -6,7 +6,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -20,6 +20,9 @@ use tokio::sync::watch;
 use super::rig::Rig;
 use clearway_daemon::base::clock::now_ns;
 use clearway_daemon::engine::newest::Newest;
+
+/// From one look at the sensor's newest firing to the next: short beside a revolution.
+const POLL: Duration = Duration::from_millis(2);
 
 /// A car that drives until it is stopped.
 pub struct DemoCar {
@@ -48,7 +51,7 @@ impl DemoCar {
         grpc: SocketAddr,
         newest: &watch::Receiver<Newest>,
     ) -> std::io::Result<Self> {
-        let halt = Arc::new(AtomicBool::new(false));
+        let (halt, newest_firing_ns) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicI64::new(i64::MIN)));
         let mut skipped = Vec::new();
         let mut new_skipped = || {
             skipped.push(Skipped::default());
@@ -57,12 +60,16 @@ impl DemoCar {
         let observer = {
             let (rig, halt, skipped, progress) = (rig.clone(), halt.clone(), new_skipped(), progress(newest));
             let (runtime, name) = (tokio::runtime::Handle::current(), name.to_owned());
-            let observe = move || runtime.block_on(observe(&name, rig, grpc, halt, progress, skipped));
+            // The poses of a car with one sensor are no earlier than its packets, on a machine that is late with those.
+            let firing_ns = rig.units.is_empty().then(|| newest_firing_ns.clone());
+            let observe = move || runtime.block_on(observe(&name, rig, grpc, halt, firing_ns, progress, skipped));
             std::thread::Builder::new().name("simulated car".into()).spawn(observe)?
         };
         let several = rig.scanners.len() > 1;
         let mut start = |(index, (name, _)): (usize, &(String, _))| {
-            let vehicle = RealTimeVehicle::new(rig.vehicle(index), progress(newest), new_skipped());
+            let firing_ns = newest_firing_ns.clone();
+            let vehicle = RealTimeVehicle::new(rig.vehicle(index), progress(newest), new_skipped())
+                .inspect(move |datagram| firing_ns.store(datagram.stamp_ns, Ordering::Relaxed));
             let own = if several { address(index) } else { Ipv4Addr::UNSPECIFIED };
             let halt = halt.clone();
             std::thread::Builder::new().name(format!("simulated {name}")).spawn(move || {
@@ -110,12 +117,14 @@ fn progress(newest: &watch::Receiver<Newest>) -> impl Fn() -> Progress + Send + 
     move || Progress { now_ns: now_ns(), mapped_ns: newest.borrow().as_ref().map(|map| map.capture_end_ns) }
 }
 
-/// Sends each observation at the time of its stamp. Scans that are too late are skipped, not simulated.
+/// Sends each observation at the time of its stamp, and not before a firing of that time (`firing_ns`). Scans that are
+/// too late are skipped, not simulated.
 async fn observe(
     name: &str,
     rig: Rig,
     grpc: SocketAddr,
     halt: Arc<AtomicBool>,
+    firing_ns: Option<Arc<AtomicI64>>,
     progress: impl Fn() -> Progress,
     skipped: Skipped,
 ) -> Result<(), ClientError> {
@@ -129,6 +138,10 @@ async fn observe(
         let Some(observation) = observations.next() else { break };
         let early_ns = u64::try_from(observation.stamp_ns - now_ns()).unwrap_or(0);
         tokio::time::sleep(Duration::from_nanos(early_ns)).await;
+        let is_early = |ns: &Arc<AtomicI64>| ns.load(Ordering::Relaxed) < observation.stamp_ns;
+        while firing_ns.as_ref().is_some_and(is_early) && !halt.load(Ordering::Relaxed) {
+            tokio::time::sleep(POLL).await;
+        }
         sent_ns = Some(observation.stamp_ns);
         ingester.send(observation.observation).await?;
     }
