@@ -259,7 +259,10 @@ fn configuration(options: &DemoOptions, rig: &Rig) -> (Config, Vec<String>) {
         let keep_mib = if options.black_box { BLACK_BOX_MIB } else { RECORDING_MIB };
         // A quarter for each part, so that what is kept is never much less than what is allowed.
         (config.recorder.keep_mb, config.recorder.part_mb) = (keep_mib, keep_mib / 4);
-        config.recorder.maps = if options.black_box { RecordedMaps::None } else { config.recorder.maps };
+        if options.black_box {
+            // No disk is too slow for it.
+            (config.recorder.maps, config.recorder.flush_ms) = (RecordedMaps::None, 10_000);
+        }
     }
     let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
     let many = options.sensors == DemoSensors::Many;
