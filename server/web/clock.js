@@ -6,6 +6,8 @@
 // quartz clocks drift apart; so a delay that grows by a millisecond a map appears as age, not as a clock offset. What
 // stays hidden is the fastest trip of the connection: an age is too small by that (and by the allowed drift), not more.
 
+import { duration } from "./text.js";
+
 const DRIFT_PPM = 100;
 // If a link lags by LAG_MS_MAX for LAG_FOR_MS, either a queue in it must be dropped or the server's clock was set back.
 const LAG_MS_MAX = 1000, LAG_FOR_MS = 10000;
@@ -60,6 +62,14 @@ export function freshness(header, came_ns, now_ns) {
   const ageAt_ms = (at_ns) => Number(at_ns - header.capture_end_ns) / 1e6;
   const why = staleness(ageAt_ms(came_ns ?? now_ns), ageAt_ms(now_ns), validity_ms);
   return { age_ms: ageAt_ms(now_ns), validity_ms, fresh: why === null, why: why ?? "" };
+}
+
+// Why a map that is shown is old although the server has a newer one; null if that is not so. age_ms: of the shown map,
+// newest_ms: of the server's newest one when the server told it, told_ms ago.
+export function behind(age_ms, newest_ms, told_ms, validity_ms) {
+  const behind_ms = age_ms - newest_ms - told_ms;
+  if (!(age_ms > validity_ms && behind_ms > validity_ms)) return null;
+  return `this browser is ${duration(behind_ms)} behind; the server's newest map was ${duration(newest_ms)} old`;
 }
 
 function staleness(on_arrival_ms, age_ms, validity_ms) {

@@ -6,6 +6,7 @@ import { readFileSync } from "node:fs";
 import test from "node:test";
 import { Feed } from "./feed.js";
 import { cellValues, newFrame } from "./frame.js";
+import { fadeSlices } from "./draw/paint.js";
 import { legendByMeaning } from "./draw/palette.js";
 import { readSettings, wantOf } from "./settings.js";
 import { gridOf } from "./wire/grid.js";
@@ -48,6 +49,21 @@ test("a layer over another one leaves what it does not know, and mixes the rest"
   assert.deepEqual(drawn, [[100, 110, 120], [52, 57, 63], [4, 5, 6], [1, 2, 3]]);
   const road = colours(frameOf({ a: [CLASSES], b: [channel("class", Uint8Array.of(1, 1, 1, 2))] }, { road: true }));
   assert.deepEqual(road[1], [4, 5, 6], "only the road is drawn over");
+});
+
+test("cells of which nothing is known are quiet, and all others are plain", () => {
+  const { pixels } = frameOf({ a: [CLASSES] });
+  assert.deepEqual([...pixels].map((pixel) => pixel >>> 24), [255, 255, 255, 128]);
+});
+
+test("slices of a radial layer are fainter the longer they are, and no square cell is", () => {
+  const grid = gridOf({ radial: { row_radius_m: [1, 5, 30], columns: 4 } }), table = Int32Array.of(0, 4, 8, -1);
+  const pixels = new Uint32Array(4).fill(0xff0000ff);
+  fadeSlices(pixels, table, GRID);
+  assert.deepEqual([...pixels], [0xff0000ff, 0xff0000ff, 0xff0000ff, 0xff0000ff]);
+  fadeSlices(pixels, table, grid);
+  assert.deepEqual([...pixels].map((pixel) => pixel >>> 24), [255, 127, 63, 255]);
+  assert.equal(pixels[2] & 0xffffff, 0x0000ff, "the colour stays");
 });
 
 test("a channel is a heat map with a colour bar, whose range only grows", () => {
@@ -141,11 +157,12 @@ test("after a map that cannot be read a whole one is asked for", () => {
 
 test("a layer is selected with those that are drawn over it, and unknown ones are not", () => {
   const layers = ["drivability", "speed", "safe_path"], settings = readSettings(null);
-  assert.deepEqual(wantOf(settings, layers).layers, ["drivability", "safe_path"]);
+  assert.deepEqual(wantOf(settings, layers).layers, ["drivability"], "safe paths are off until they are wanted");
+  assert.deepEqual(wantOf({ ...settings, safe_points: true }, layers).layers, ["drivability", "safe_path"]);
   assert.deepEqual(wantOf(settings, ["terrain"]).layers, ["terrain"]);
   const chosen = { ...settings, layer: "speed", overlays: ["drivability", "speed", "x"], road: true, max_rate_hz: 2 };
   const want = wantOf(chosen, layers);
-  assert.deepEqual([want.layers, want.max_rate_hz], [["drivability", "safe_path", "speed"], 2]);
+  assert.deepEqual([want.layers, want.max_rate_hz], [["drivability", "speed"], 2]);
   assert.deepEqual(want.show.overlays, ["drivability"]);
 });
 

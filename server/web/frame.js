@@ -5,7 +5,9 @@
 // safe_points: true if they are wanted, by_meaning: true for colours by meaning, space: true for the view in 3-D, whose
 // frame has `space` (space/cells.js) and no pixels }.
 
-import { blendPixels, isId, overlayColours, paintChannel, paintPixels } from "./draw/paint.js";
+import {
+  blendPixels, fadeSlices, isId, overlayColours, paintChannel, paintPixels, quietColours,
+} from "./draw/paint.js";
 import { legendByMeaning } from "./draw/palette.js";
 import { CONFIDENCE, hasConfidence, spaceOf } from "./space/cells.js";
 import { count, valueText, words } from "./text.js";
@@ -22,13 +24,16 @@ export function newFrame(map, show, raster, ranges) {
   const cells = layer.cells(channel.name), key = `${layer.name} ${channel.name}`;
   const { colours, legend, range, bar } = paintChannel(layer, channel, cells, ranges.get(key) ?? null);
   ranges.set(key, range);
+  const drawn = channel.name === "class" ? quietColours(layer, colours) : colours;
   const pixels = show.space ? null : new Uint32Array(raster.width * raster.height);
   if (pixels) {
-    paintPixels(pixels, pixelCells(layer.grid, raster), cells, colours);
+    const table = pixelCells(layer.grid, raster);
+    paintPixels(pixels, table, cells, drawn);
+    fadeSlices(pixels, table, layer.grid);
     for (const name of show.overlays) drawOver(map.layer(name), ({ meaning }) => meaning !== "unknown");
     if (show.road) for (const name of map.names) drawOver(map.layer(name), (entry) => entry.name === ROAD);
   }
-  const space = show.space ? spaceOf(map, layer, channel, cells, colours, show) : null;
+  const space = show.space ? spaceOf(map, layer, channel, cells, drawn, show) : null;
   if (space && hasConfidence(layer, channel)) legend.push(...CONFIDENCE);
   return {
     base: { layer: layer.name, channel: channel.name },

@@ -167,11 +167,18 @@ document.addEventListener("keydown", (event) => {
   const is_typing = event.target.closest?.("input:not([type=checkbox],[type=radio],[type=range]), select, textarea");
   if (is_typing || event.ctrlKey || event.metaKey || event.altKey) return;
   const isIn = (name) => document.body.dataset.view === name;
-  if (event.key === "f" && isIn("vehicle")) go(null);
+  if (event.key === "?") $("keys").showModal();
+  else if ($("keys").open) return;
+  else if (event.key === "f" && isIn("vehicle")) go(null);
   else if (event.key === "/" && isIn("fleet")) $("find").focus();
   else if (!isIn("vehicle") || !view.pressKey(event.key)) return;
   event.preventDefault();
 });
+
+$("help").onclick = () => $("keys").showModal();
+
+// Without these words the legend has its names alone.
+fetch("classes.json").then((answer) => answer.json()).then((classes) => view.explain(classes)).catch(() => {});
 
 writeLink();
 if (!isUndecided()) show(query().get("vehicle"));

@@ -15,7 +15,8 @@ export class MapStream {
   // The map that the next delta starts from; null if maps are whole.
   #base = null;
 
-  // Starts a new connection. The maps that were made while there was none count neither as skipped nor as lost.
+  // Starts a new connection or selection. The maps that were made while there was none count neither as skipped nor as
+  // lost.
   restart() {
     this.#is_new_connection = true;
     this.#unreadable = 0n;
@@ -35,7 +36,9 @@ export class MapStream {
       throw error;
     }
     this.counts.skipped += update.skipped;
-    if (this.#isNew(update)) {
+    if (this.#isShownAgain(update)) {
+      this.#newest = update;
+    } else if (this.#isNew(update)) {
       if (this.#newest) this.counts.replaced++;
       this.#newest = update;
       this.#last = update.map.header;
@@ -53,6 +56,12 @@ export class MapStream {
     return newest;
   }
 
+  // True if a new connection or selection begins with the last map that was received: it may have other layers.
+  #isShownAgain({ map: { header } }) {
+    const last = this.#last;
+    return this.#is_new_connection && last?.boot_id === header.boot_id && last.sequence === header.sequence;
+  }
+
   // True if the map follows those received so far. Counts the gap before it.
   #isNew({ map: { header }, skipped }) {
     const last = this.#last;
@@ -63,8 +72,7 @@ export class MapStream {
     }
     const ahead = header.sequence - last.sequence;
     if (ahead <= 0n) {
-      // After a reconnection the server sends its newest map, which may be the last one received.
-      if (ahead < 0n || !this.#is_new_connection) this.counts.repeated++;
+      this.counts.repeated++;
       return false;
     }
     const missing = ahead - 1n - skipped - this.#unreadable;

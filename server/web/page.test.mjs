@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import test from "node:test";
-import { freshness, ServerClock } from "./clock.js";
+import { behind, freshness, ServerClock } from "./clock.js";
 import { paintChannel } from "./draw/paint.js";
 import { MapStream } from "./map_stream.js";
 import { view as recorderView } from "./recorder.js";
@@ -48,6 +48,15 @@ test("a stale map says why in the words of every client", () => {
     const age = freshness({ capture_end_ns: ns(5000), valid_until_ns: ns(5300) }, came, came + ns(since_arrival_ms));
     assert.deepEqual([age.fresh, age.why], [stale_because === null, stale_because ?? ""]);
   }
+});
+
+test("a browser that lags says how far, and how old the server's newest map is", () => {
+  const words = "this browser is 9.0 s behind; the server's newest map was 400 ms old";
+  assert.equal(behind(9400, 400, 0, 300), words);
+  assert.equal(behind(9400, 9000, 300, 300), null, "the server has no newer one either");
+  assert.equal(behind(200, 40, 0, 300), null, "the map is fresh");
+  for (const unknown of [null, undefined]) assert.equal(behind(unknown, 40, 0, 300), null);
+  assert.equal(behind(9400, undefined, 0, 300), null);
 });
 
 test("a sensor's clock is named with how far the host is from it", () => {
@@ -105,6 +114,16 @@ test("a map that arrives twice is repeated, but not if a new connection starts w
   const two = { received: 2, replaced: 1 };
   assert.deepEqual(countsAfter({ sequence: 5 }, "restart", { sequence: 5 }, { sequence: 6 }), two);
   assert.deepEqual(countsAfter({ sequence: 5 }, "restart", { sequence: 9 }), two);
+});
+
+test("the last map is shown again with the layers of a new selection", () => {
+  const stream = new MapStream();
+  stream.push(update({ sequence: 5 }));
+  stream.removeNewest();
+  stream.restart();
+  stream.push(update({ sequence: 5 }));
+  assert.equal(stream.removeNewest().map.header.sequence, 5n);
+  assert.deepEqual([stream.counts.received, stream.counts.repeated], [1n, 0n]);
 });
 
 test("a server that starts again is counted, and its sequence starts again", () => {

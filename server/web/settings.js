@@ -2,7 +2,7 @@
 
 const KEY = "clearway.page";
 const DEFAULTS = {
-  layer: "freespace", channel: "class", overlays: [], road: false, safe_points: true, trail: true, by_meaning: false,
+  layer: "freespace", channel: "class", overlays: [], road: false, safe_points: false, trail: true, by_meaning: false,
   space: false, points: false, max_rate_hz: 0, save_data: false, order: "state", only: "all",
 };
 

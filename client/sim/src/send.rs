@@ -4,6 +4,7 @@
 
 use std::io;
 use std::net::{SocketAddr, UdpSocket};
+use std::ops::AddAssign;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -36,8 +37,19 @@ pub struct Sent {
     pub packets: u64,
     /// Telemetry datagrams.
     pub telemetry: u64,
+    /// Answers of the data target's machine that no socket is open there.
+    pub refused: u64,
     /// Device time from the first datagram to the last.
     pub device_time: Duration,
+}
+
+impl AddAssign for Sent {
+    fn add_assign(&mut self, other: Self) {
+        self.packets += other.packets;
+        self.telemetry += other.telemetry;
+        self.refused += other.refused;
+        self.device_time = self.device_time.max(other.device_time);
+    }
 }
 
 /// Datagrams that are due within this time are sent at once, so that the thread sleeps at most once a millisecond. The
@@ -57,6 +69,8 @@ pub fn drive(
     until: Until<'_>,
 ) -> io::Result<Sent> {
     let socket = UdpSocket::bind(own)?;
+    // The system gives a connected socket alone the answers to earlier datagrams.
+    socket.connect(data)?;
     let began = Instant::now();
     let mut first_ns = None;
     let mut sent = Sent::default();
@@ -80,11 +94,20 @@ pub fn drive(
             Kind::Data => (data, &mut sent.packets),
             Kind::Telemetry => (telemetry, &mut sent.telemetry),
         };
-        match socket.send_to(&datagram.payload, to) {
-            // The answer to an earlier datagram on loopback: no socket is open at the target, which UDP does not need.
-            Err(error) if error.kind() != io::ErrorKind::ConnectionRefused => return Err(error),
-            _ => *count += 1,
+        let send = || socket.send_to(&datagram.payload, to);
+        // The answer to an earlier datagram, in place of which this one was not sent.
+        let is_refused = |sent: &io::Result<usize>| {
+            sent.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused)
+        };
+        let mut result = send();
+        if is_refused(&result) {
+            sent.refused += 1;
+            result = send();
         }
+        if !is_refused(&result) {
+            result?;
+        }
+        *count += 1;
         sent.device_time = device_time;
     }
     Ok(sent)
@@ -106,11 +129,20 @@ mod tests {
         let until = Until { device_time: Some(Duration::from_millis(31)), ..Until::default() };
         let sent =
             drive("127.0.0.1:0".parse().unwrap(), datagrams, ends.0, ends.1, Pace::AsFastAsPossible, until).unwrap();
-        assert_eq!(sent, Sent { packets: 24, telemetry: 8, device_time: Duration::from_millis(31) });
+        assert_eq!(sent, Sent { packets: 24, telemetry: 8, refused: 0, device_time: Duration::from_millis(31) });
         let mut buffer = [0; 64];
         for number in 0..32 {
             let socket = if number % 4 == 0 { &telemetry } else { &data };
             assert_eq!((socket.recv(&mut buffer).unwrap(), buffer[0]), (10, number));
         }
+    }
+
+    #[test]
+    fn datagrams_to_a_closed_port_are_refused_and_counted() {
+        let closed = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let datagrams = (0..9).map(|_| Datagram { stamp_ns: 0, kind: Kind::Data, payload: vec![0; 10] });
+        let own = "127.0.0.1:0".parse().unwrap();
+        let sent = drive(own, datagrams, closed, closed, Pace::AsFastAsPossible, Until::default()).unwrap();
+        assert_eq!((sent.packets, sent.refused), (9, 8));
     }
 }

@@ -75,6 +75,7 @@ async fn send(RecorderArguments { server, json, request }: RecorderArguments) ->
         None if status.code() == Code::InvalidArgument => usage_error(status.message()),
         None => Error::msg(status.message().to_owned()),
     };
+    let is_status = matches!(request, RecorderSubcommand::Status);
     let answer = match request {
         RecorderSubcommand::Start => recorder.start(v1::StartRecordingRequest {}).await,
         RecorderSubcommand::Stop => recorder.stop(v1::StopRecordingRequest {}).await,
@@ -108,10 +109,10 @@ async fn send(RecorderArguments { server, json, request }: RecorderArguments) ->
         let since = since_ns.map_or(String::new(), |ns| format!(" since {}", utc(ns)));
         print_line(&format!("  {parts} not yet in the store{since}{why}"))?;
     }
-    for (vehicle, events) in &status.durable_events {
+    for (vehicle, events) in status.durable_events.iter().filter(|_| is_status) {
         print_line(&format!("  {vehicle}: events below {events} are on the disk"))?;
     }
-    for topic in &status.topics {
+    for topic in status.topics.iter().filter(|_| is_status) {
         let v1::TopicCount { topic, offered, written, dropped } = topic;
         print_line(&format!("  {topic}: offered {offered}, written {written}, dropped {dropped}"))?;
     }
@@ -140,7 +141,10 @@ fn print_parts(parts: &[v1::RecordedPart], json: bool) -> Result<()> {
             (false, true) => ", unfinished",
             (false, false) => "",
         };
-        print_line(&format!("{}: {} bytes{state}", part.file, part.bytes))?;
+        let (megabytes, written) = (part.bytes as f64 / 1e6, utc(part.modified_ns.try_into().unwrap_or(0)));
+        print_line(&format!("{}: {megabytes:.1} MB, written {written}{state}", part.file))?;
     }
+    let megabytes = parts.iter().map(|part| part.bytes).sum::<u64>() as f64 / 1e6;
+    print_line(&format!("{}, {megabytes:.1} MB", counted(parts.len() as u64, "part")))?;
     Ok(())
 }

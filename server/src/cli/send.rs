@@ -88,14 +88,17 @@ pub fn run(arguments: SendArguments) -> Result<Exit> {
     let summary = send(&options, |bytes| bar.set_position(bytes))?;
     bar.finish_and_clear();
     print_line(&if json { document(&summary) } else { text(&summary, &options) })?;
-    Ok(Exit::from_incomplete(summary.cut.is_some()))
+    if summary.sent.refused > 0 {
+        eprintln!("clearway: no socket is open at {to}: its machine refused datagrams {} times", summary.sent.refused);
+    }
+    Ok(Exit::from_incomplete(summary.cut.is_some() || summary.sent.refused > 0))
 }
 
 fn document(summary: &SendSummary) -> String {
     let SendSummary { sent, elapsed, skipped, notes, cut, network } = summary;
     json!({
-        "packets": sent.packets, "telemetry": sent.telemetry, "skipped": skipped, "notes": notes, "seconds": elapsed.as_secs_f64(),
-        "cut": cut, "network": network.as_ref().map(network::document),
+        "packets": sent.packets, "telemetry": sent.telemetry, "refused": sent.refused, "skipped": skipped,
+        "notes": notes, "seconds": elapsed.as_secs_f64(), "cut": cut, "network": network.as_ref().map(network::document),
     })
     .to_string()
 }

@@ -6,12 +6,13 @@ use std::process::Command;
 use anyhow::Result;
 use clap::Args;
 use clearway_daemon::replay::{ReplayOptions, ReplayRun, ServedReplay, describe};
+use clearway_proto::v1::ReplayControl;
 
 use crate::cli::replay::{offset, print_remarks};
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, print_line, stop_signal};
 
-/// Look at recorded drives on the page: paused, with a time bar, a step and all layers.
+/// Look at recorded drives on the page: paused at the first map, with a time bar, a step and all layers.
 ///
 /// Replays the files as recorded on free ports of this machine, and prints the address of the page. `clearway
 /// transport` works too.
@@ -51,7 +52,15 @@ pub fn run(arguments: ViewArguments) -> Result<Exit> {
                 tracing::warn!(%error, "xdg-open");
             }
         }
-        Ok(replay.play(stop).await?)
+        let handle = replay.handle();
+        let first_maps = async {
+            if seek_s.is_none() {
+                let step = u32::try_from(handle.state().borrow().vehicles.len()).ok();
+                // Fails if the replay ends before.
+                let _ = handle.control(ReplayControl { step, ..ReplayControl::default() }).await;
+            }
+        };
+        Ok(tokio::join!(replay.play(stop), first_maps).0?)
     })?;
     Ok(Exit::from_incomplete(!print_remarks(&summary)))
 }

@@ -2,7 +2,7 @@
 // In: a pen whose unit is a CSS pixel, and a view (vehicle/view.js).
 
 import { css, PLAN_COLOUR } from "./palette.js";
-import { egoFrom, toPixel } from "../vehicle/view.js";
+import { egoFrom, planLines, toPixel } from "../vehicle/view.js";
 
 const RINGS_M = [5, 10, 20, 40, 60, 80];
 // A ring is drawn if it is this many pixels from the vehicle at least.
@@ -11,13 +11,8 @@ const RING_PX_MIN = 40;
 const LENGTH_M = 4.5, WIDTH_M = 1.8;
 // The vehicle is drawn at least this long, in pixels.
 const VEHICLE_PX_MIN = 12;
-const BAND = "rgb(255 255 255 / 20%)", EDGE = "rgb(255 255 255 / 55%)";
 // A line is drawn twice, dark and then light, so that it is seen on every colour.
 const PATH = [["rgb(10 14 18 / 85%)", 4.5], ["#ffe14d", 2]], TRAIL = [["rgb(10 14 18 / 70%)", 4], ["#7fd6ff", 1.75]];
-// Half the width of the cross at a plan's goal.
-const GOAL_M = 0.75;
-// Every so many safe points, the circle itself is drawn. The points lie a cell apart, 0.25 m by default.
-const CIRCLE_EVERY = 16;
 
 function strokeTwice(pen, path, strokes) {
   pen.lineCap = pen.lineJoin = "round";
@@ -86,50 +81,23 @@ export function drawTrail(pen, view, size, points, pose) {
   strokeTwice(pen, path, TRAIL);
 }
 
-// points: of wire/safe_points.js; null draws nothing. The ground within their radii is a band.
+// points: of wire/safe_points.js; null draws nothing.
 export function drawSafePoints(pen, view, size, points) {
   if (!points || points.x.length === 0) return;
-  const at = (i) => toPixel(view, size, points.x[i], points.y[i]), per_metre = 1 / view.metres;
-  // One path for all circles: where they overlap, the band is not brighter.
-  const band = new Path2D(), circles = new Path2D(), lines = new Path2D();
-  const circle = (path, i) => {
-    const { px, py } = at(i), radius = points.radius[i] * per_metre;
-    path.moveTo(px + radius, py);
-    path.arc(px, py, radius, 0, 2 * Math.PI);
-  };
-  // Point 0 is the vehicle's position.
-  for (let i = 1; i < points.x.length; i++) {
-    circle(band, i);
-    if (i % CIRCLE_EVERY === 1) circle(circles, i);
-  }
+  const lines = new Path2D(), at = (i) => Object.values(toPixel(view, size, points.x[i], points.y[i]));
   for (const [from, to] of points.links) {
-    lines.moveTo(at(from).px, at(from).py);
-    lines.lineTo(at(to).px, at(to).py);
+    lines.moveTo(...at(from));
+    lines.lineTo(...at(to));
   }
-  pen.fillStyle = BAND;
-  pen.fill(band, "nonzero");
-  pen.strokeStyle = EDGE;
-  pen.lineWidth = 0.75;
-  pen.stroke(circles);
   strokeTwice(pen, lines, PATH);
 }
 
-// plan: of a MapUpdate; null draws nothing. Its path, its footprint at the end, and a cross at its goal.
+// plan: of a MapUpdate; null draws nothing.
 export function drawPlan(pen, view, size, plan) {
   if (!plan) return;
-  const lines = new Path2D(), { x, y, heading_rad, footprint_m, goal } = plan;
-  const at = (x, y) => Object.values(toPixel(view, size, x, y));
-  const to = (i, x, y) => (i ? lines.lineTo(...at(x, y)) : lines.moveTo(...at(x, y)));
-  x.forEach((x, i) => to(i, x, y[i]));
-  const end = x.length - 1, [sin, cos] = [Math.sin(heading_rad[end]), Math.cos(heading_rad[end])];
-  for (let i = 0; i < footprint_m.length; i += 2) {
-    const [forward, left] = [footprint_m[i], footprint_m[i + 1]];
-    to(i, x[end] + cos * forward - sin * left, y[end] + sin * forward + cos * left);
-  }
-  if (footprint_m.length) lines.closePath();
-  for (const side of goal ? [-GOAL_M, GOAL_M] : []) {
-    lines.moveTo(...at(goal.x - GOAL_M, goal.y - side));
-    lines.lineTo(...at(goal.x + GOAL_M, goal.y + side));
+  const lines = new Path2D(), at = (point) => Object.values(toPixel(view, size, ...point));
+  for (const line of planLines(plan)) {
+    line.forEach((point, i) => (i ? lines.lineTo(...at(point)) : lines.moveTo(...at(point))));
   }
   strokeTwice(pen, lines, [["rgb(10 14 18 / 85%)", 4.5], [css(PLAN_COLOUR), 2.25]]);
 }

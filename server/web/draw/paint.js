@@ -28,6 +28,38 @@ export function paintPixels(pixels, table, cells, colours) {
   for (let i = 0; i < table.length; i++) pixels[i] = table[i] < 0 ? 0 : colours[cells[table[i]] - low];
 }
 
+// The colours of classes as they are drawn: cells that no sensor saw do not lead the eye.
+const QUIET = 0.5;
+export const isQuiet = (meaning) => meaning === "unknown" || meaning === "hidden";
+
+export function quietColours(layer, colours) {
+  const drawn = colours.slice();
+  layer.legend.forEach(({ meaning }, value) => {
+    if (isQuiet(meaning)) drawn[value] = (colours[value] & 0xffffff) | (Math.round(255 * QUIET) << 24);
+  });
+  return drawn;
+}
+
+// The length of a cell, in metres, from which it is fainter the longer it is, and how faint at most: a slice of 20 m
+// says little, and must not lead the eye.
+const PLAIN_M = 2, FAINTEST = 0.25;
+
+// Makes the long slices of a radial layer faint.
+export function fadeSlices(pixels, table, { is_straight, shape: [rows, columns], corners }) {
+  if (is_straight) return;
+  const opacity = new Float64Array(rows), xy = new Float64Array(8);
+  for (let row = 0; row < rows; row++) {
+    corners(row * columns, xy);
+    const length_m = Math.hypot(xy[2] - xy[0], xy[3] - xy[1]);
+    opacity[row] = Math.min(Math.max(PLAIN_M / length_m, FAINTEST), 1);
+  }
+  for (let i = 0; i < table.length; i++) {
+    if (table[i] < 0) continue;
+    const alpha = (pixels[i] >>> 24) * opacity[Math.floor(table[i] / columns)];
+    pixels[i] = (pixels[i] & 0xffffff) | (alpha << 24);
+  }
+}
+
 // Draws a layer over pixels that are painted: half of its colour and half of theirs. colours: an ImageData word for
 // each raw value, 0 for those that leave a pixel as it is.
 export function blendPixels(pixels, table, cells, colours) {

@@ -54,3 +54,13 @@ export function project(matrix, { width, height }, [x, y, z]) {
   const w = row(3);
   return w < NEAR_M ? null : { px: (width / 2) * (1 + row(0) / w), py: (height / 2) * (1 - row(1) / w) };
 }
+
+// Where a pixel meets the ground plane under the vehicle, in the ego frame; null over the horizon.
+export function groundAt({ yaw, pitch, distance_m, x_m, y_m }, { width, height }, px, py) {
+  const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
+  const half = Math.tan(FIELD_OF_VIEW / 2) / height, right = (2 * px - width) * half, up = (height - 2 * py) * half;
+  const down = sp - up * cp;
+  if (!(down > 0)) return null;
+  const reach = (distance_m * sp) / down, ahead = reach * (cp + up * sp) - distance_m * cp, left = -reach * right;
+  return { x: x_m + ahead * cy - left * sy, y: y_m + ahead * sy + left * cy };
+}

@@ -43,15 +43,25 @@ export class QuadList {
     this.push(xy, z(0), z(2), z(4), z(6), colour);
   }
 
+  // A side of a prism over a quad: over its edge `edge` (from corner `edge` to the next), from `low` to `high` over the
+  // plane.
+  pushSide(xy, edge, [a, b, c], low, high, colour) {
+    const i = 2 * edge, j = (i + 2) % 8, from = a * xy[i] + b * xy[i + 1] + c, to = a * xy[j] + b * xy[j + 1] + c;
+    const side = [xy[i], xy[i + 1], xy[j], xy[j + 1], xy[j], xy[j + 1], xy[i], xy[i + 1]];
+    this.push(side, from + low, to + low, to + high, from + high, colour);
+  }
+
   // A prism over a quad: from the plane up to `height` over it. It has no floor.
   pushBox(xy, plane, height, colour) {
-    const [a, b, c] = plane;
-    for (let i = 0; i < 8; i += 2) {
-      const j = (i + 2) % 8, from = a * xy[i] + b * xy[i + 1] + c, to = a * xy[j] + b * xy[j + 1] + c;
-      const side = [xy[i], xy[i + 1], xy[j], xy[j + 1], xy[j], xy[j + 1], xy[i], xy[i + 1]];
-      this.push(side, from, to, to + height, from + height, colour);
-    }
+    for (let edge = 0; edge < 4; edge++) this.pushSide(xy, edge, plane, 0, height, colour);
     this.pushInPlane(xy, plane, height, colour);
+  }
+
+  // All quads of another list, after those so far.
+  append(list) {
+    while ((this.count + list.count) * QUAD_BYTES > this.#words.byteLength) this.#grow();
+    new Uint8Array(this.#words.buffer).set(list.bytes, this.count * QUAD_BYTES);
+    this.count += list.count;
   }
 
   // A line on the ground with a width.

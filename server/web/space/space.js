@@ -4,11 +4,13 @@
 
 import { count, setText } from "../text.js";
 import { HIGH_M, LOW_M, Scene } from "./gl.js";
-import { matrixOf, move, project, START, turn, zoom } from "./orbit.js";
+import { groundAt, matrixOf, move, project, START, turn, zoom } from "./orbit.js";
 import { Poses } from "./points.js";
-import { RINGS_M, trailQuads, vehicleQuads } from "./vehicle.js";
+import { planQuads, probeQuads, RINGS_M, trailQuads, vehicleQuads } from "./vehicle.js";
 
 const WHEEL_ZOOM = 0.0015, KEY_ZOOM = 1.3, KEY_PX = 30;
+// A drag is this long at least; less is a click.
+const DRAG_MIN_PX = 4;
 // Points older than this beside the shown map are not drawn: things moved meanwhile.
 const POINTS_APART_NS = 2_000_000_000n;
 const NONE = { bytes: new Uint8Array(0), count: 0 }, NOT_MOVED = { x: 0, y: 0, yaw: 0 };
@@ -21,6 +23,7 @@ export class Space {
   #settings;
   #changed;
   #ask;
+  #probe;
   #scene = null;
   // True from the loss of WebGL, for instance when the graphics card's process ends, until the browser gives it back.
   #is_lost = false;
@@ -37,9 +40,14 @@ export class Space {
   #poses = new Poses();
   #labels = [];
 
-  // ask({ vehicle, wanted }): a request for points.
-  constructor(settings, changed, ask) {
+  // ask({ vehicle, wanted }): a request for points. probe({ x, y } or null): the place whose cell is asked for.
+  constructor(settings, changed, ask, probe) {
     [this.#settings, this.#changed, this.#ask] = [settings, changed, ask];
+    this.#probe = (at) => {
+      this.#quads.set("probe", probeQuads(at));
+      this.#schedule();
+      probe(at);
+    };
     const button = $("space-button"), points = $("space-points");
     button.onclick = () => this.#set({ space: !this.is_open });
     points.checked = settings.points;
@@ -89,6 +97,7 @@ export class Space {
     if (!frame) this.#quads.set("cells", NONE);
     if (frame && frame !== this.#frame) this.#poses.push(frame.header.capture_end_ns, pose);
     this.#quads.set("trail", pose ? trailQuads(trail, pose) : NONE);
+    this.#quads.set("plan", planQuads(frame?.plan));
     this.#frame = frame;
     this.#schedule();
   }
@@ -124,7 +133,7 @@ export class Space {
     this.#write();
     this.#changed();
     this.#schedule();
-    if ("space" in changes) (this.is_open ? this.#canvas : $("map")).focus();
+    if ("space" in changes) (this.is_open ? this.#canvas : $("map")).focus({ preventScroll: true });
   }
 
   // Makes the scene at the first need; false if the browser cannot now.
@@ -221,18 +230,21 @@ export class Space {
     this.zoom(Math.exp(-pixels * WHEEL_ZOOM));
   }
 
-  // One pointer turns, with Shift or another button it moves; two move and pinch.
+  // One pointer turns, with Shift or another button it moves; two move and pinch. A click or a tap asks for a cell.
   #followPointers() {
     const canvas = this.#canvas, pointers = new Map();
+    let dragged_px = 0;
     canvas.oncontextmenu = (event) => event.preventDefault();
     canvas.onpointerdown = (event) => {
       canvas.setPointerCapture(event.pointerId);
+      if (pointers.size === 0) dragged_px = 0;
       pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     };
     canvas.onpointermove = (event) => {
       const before = pointers.get(event.pointerId), now = { x: event.clientX, y: event.clientY };
       if (!before) return;
       const [dx, dy] = [now.x - before.x, now.y - before.y];
+      dragged_px += Math.hypot(dx, dy);
       const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
       pointers.set(event.pointerId, now);
       const is_move = event.shiftKey || event.buttons > 1;
@@ -240,7 +252,12 @@ export class Space {
       const apart = (at) => Math.max(Math.hypot(at.x - other.x, at.y - other.y), 1);
       this.#look(move(zoom(this.#camera, apart(now) / apart(before)), this.#size, dx / 2, dy / 2));
     };
-    canvas.onpointerup = canvas.onpointercancel = (event) => pointers.delete(event.pointerId);
+    canvas.onpointerup = canvas.onpointercancel = (event) => {
+      pointers.delete(event.pointerId);
+      if (event.type !== "pointerup" || pointers.size > 0 || dragged_px >= DRAG_MIN_PX) return;
+      const box = canvas.getBoundingClientRect();
+      this.#probe(groundAt(this.#camera, this.#size, event.clientX - box.left, event.clientY - box.top));
+    };
   }
 
   #pressKey(event) {
@@ -250,7 +267,7 @@ export class Space {
     }[event.key];
     const act = {
       "+": () => this.zoom(KEY_ZOOM), "=": () => this.zoom(KEY_ZOOM), "-": () => this.zoom(1 / KEY_ZOOM),
-      0: () => this.reset(),
+      0: () => this.reset(), Escape: () => this.#probe(null),
     }[event.key];
     if (!by && !act) return;
     event.preventDefault();
@@ -263,7 +280,7 @@ export class Space {
 export function text(frame, wants_points, points, refusal) {
   const cells = frame?.space ? (SOURCES[frame.space.source] ?? "no planes: cells lie at height 0") : "no map yet";
   if (!wants_points) return cells;
-  if (!points) return `${cells} · ${refusal ?? "waiting for points"}`;
+  if (!points) return `${cells} · ${refusal ?? "points come with the next map"}`;
   const part = points.count < points.total ? ` of ${count(points.total)}` : "";
   return `${cells} · ${count(points.count)}${part} points, dark ${LOW_M} m to bright ${HIGH_M} m over the ground here`;
 }

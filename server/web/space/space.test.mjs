@@ -6,7 +6,7 @@ import test from "node:test";
 import { newFrame } from "../frame.js";
 import { gridOf } from "../wire/grid.js";
 import { groundOf } from "./ground.js";
-import { matrixOf, move, project, START, turn, zoom } from "./orbit.js";
+import { groundAt, matrixOf, move, project, START, turn, zoom } from "./orbit.js";
 import { isPoints, Poses, readPoints } from "./points.js";
 import { COLOUR_AT, CORNER_BYTES, QUAD_BYTES, QuadList } from "./quads.js";
 import { text } from "./space.js";
@@ -109,7 +109,7 @@ const quadsOf = (layers, base, show = {}) => {
 };
 const zs = ({ corners }) => corners.map(([, , z]) => z);
 
-test("terrain's cells lie in their planes, and an obstacle without a plane is a box on the ground", () => {
+test("terrain's cells lie in their planes, and around an obstacle without a plane stands an outline", () => {
   const terrain = [[
     channel("class", Uint8Array.of(0, 1, 2, 0)),
     plane("height", 0.05, [-128, 20, -128, 0]),
@@ -118,11 +118,12 @@ test("terrain's cells lie in their planes, and an obstacle without a plane is a 
   ]];
   const { quads, space } = quadsOf({ terrain }, "terrain");
   assert.equal(space.source, "terrain");
-  assert.equal(quads.length, 1 + 5, "one plane, one box; nothing of cells that are unknown");
+  assert.equal(quads.length, 2 + 4 * 2, "two planes, four sides with a rim each; nothing of cells that are unknown");
   // Ahead right: 1 m high in the middle, rising by 1 m ahead, falling by 2 m to the left.
   assert.deepEqual(quads[0].corners, [[0, -10, 1.5], [10, -10, 2.5], [10, 0, 0.5], [0, 0, -0.5]]);
   assert.deepEqual(quads[0].colour, [4, 5, 6, 255]);
-  assert.deepEqual(zs(quads[5]), [0.5, 0.5, 0.5, 0.5], "the roof");
+  assert.deepEqual([zs(quads[1]), zs(quads[2])], [[0, 0, 0, 0], [0, 0, 0.42, 0.42]], "open above");
+  assert.deepEqual([zs(quads[3]), quads[2].colour[3], quads[3].colour[3]], [[0.42, 0.42, 0.5, 0.5], 64, 255]);
 });
 
 test("without terrain's planes the cells of every layer lie in those of the segments", () => {
@@ -141,7 +142,8 @@ test("an obstacle is as high as its layer says", () => {
   const classes = channel("class", Uint8Array.of(2, 2, 1, 1));
   const height = plane("unit_height", 0.05, [40, -128, 100, 0]);
   const { quads } = quadsOf({ drivability: [[classes, height]] }, "drivability");
-  assert.deepEqual([quads[4], quads[9], quads[10]].map((quad) => zs(quad)[0]), [2, 0.5, 0]);
+  const tops = quads.slice(2).map((quad) => zs(quad)[2]).filter((_, i) => i % 2);
+  assert.deepEqual(tops, [2, 2, 2, 0.5, 0.5, 0.5], "no side between two obstacles");
 });
 
 test("cells with hits are crimson to red, and the road lies over them", () => {
@@ -160,7 +162,7 @@ test("a layer over another one is half seen through", () => {
   const layers = { a: [[channel("class", Uint8Array.of(1, 0, 0, 0))]], b: [[channel("class", Uint8Array.of(2, 0, 0, 0))]] };
   const { quads } = quadsOf(layers, "a", { overlays: ["b"] });
   assert.equal(quads[0].colour[3], 255);
-  assert.deepEqual(quads.at(-1).colour, [200, 0, 0, 128]);
+  assert.deepEqual(quads[1].colour, [200, 0, 0, 128]);
 });
 
 test("ahead is up from behind the vehicle, and left is left", () => {
@@ -169,6 +171,17 @@ test("ahead is up from behind the vehicle, and left is left", () => {
   near(at([0, 0, 0]).py, 200);
   assert.ok(at([10, 0, 0]).py < 200 && at([0, 0, 5]).py < 200 && at([0, 10, 0]).px < 400);
   assert.equal(at([-100, 0, 0]), null, "behind the camera");
+});
+
+test("a click on the picture is a place on the ground", () => {
+  for (const camera of [START, { ...START, yaw: 2, pitch: 1.2, x_m: -3, y_m: 7 }]) {
+    for (const place of [[5, 2, 0], [-4, 9, 0], [8, 0, 0]]) {
+      const pixel = project(matrixOf(camera, SIZE), SIZE, place), at = groundAt(camera, SIZE, pixel.px, pixel.py);
+      near(at.x, place[0], 1e-3);
+      near(at.y, place[1], 1e-3);
+    }
+  }
+  assert.equal(groundAt({ ...START, pitch: 0.05 }, SIZE, 400, 0), null, "the sky");
 });
 
 test("from above at its distance, the camera sees as many metres as its angle says", () => {
@@ -245,7 +258,7 @@ test("the vehicle stands where its outline is, and its trail lies behind it", ()
 test("the view says what is drawn, and how many points of how many", () => {
   const frame = (source) => ({ space: { source } });
   assert.equal(text(frame("terrain"), false, null), "cells in terrain's planes");
-  assert.equal(text(frame(null), true, null), "no planes: cells lie at height 0 · waiting for points");
+  assert.equal(text(frame(null), true, null), "no planes: cells lie at height 0 · points come with the next map");
   assert.equal(text(null, true, null, "not allowed"), "no map yet · not allowed");
   assert.match(text(frame("drivability"), true, { count: 60000, total: 120001 }), /· 60,000 of 120,001 points, dark/);
 });

@@ -1,12 +1,15 @@
-// What the view in 3-D shows beside a map: the vehicle as a box, range rings, and its trail.
+// What the view in 3-D shows beside a map: the vehicle as a box, range rings, its trail, its plan, and the place of a
+// cell.
 
-import { word } from "../draw/palette.js";
-import { egoFrom } from "../vehicle/view.js";
+import { PLAN_COLOUR, word } from "../draw/palette.js";
+import { egoFrom, planLines } from "../vehicle/view.js";
 import { QuadList } from "./quads.js";
 
 export const RINGS_M = [5, 10, 20, 40, 60, 80];
 const RING = word([214, 224, 230]), BODY = word([238, 242, 245]), CABIN = word([96, 108, 120]);
 const TRAIL = word([127, 214, 255]), TRAIL_WIDTH_M = 0.2, TRAIL_Z_M = 0.14;
+const PLAN = word(PLAN_COLOUR), PLAN_WIDTH_M = 0.25, PLAN_Z_M = 0.2;
+const PROBE = word([255, 255, 255]), PROBE_M = 0.7, PROBE_Z_M = 0.24;
 const RING_WIDTH_M = 0.12, RING_Z_M = 0.12;
 // Length and width of a vehicle whose configuration has no outline, metres.
 const LENGTH_M = 4.5, WIDTH_M = 1.8;
@@ -37,5 +40,24 @@ export function trailQuads(points, pose) {
     return [x, y, TRAIL_Z_M];
   };
   for (let i = 1; i < points.length; i++) quads.pushLine(at(points[i - 1]), at(points[i]), TRAIL_WIDTH_M, TRAIL);
+  return { bytes: quads.bytes, count: quads.count };
+}
+
+// plan: of a MapUpdate, or null. As the trail, it has no heights.
+export function planQuads(plan) {
+  const quads = new QuadList(256), at = ([x, y]) => [x, y, PLAN_Z_M];
+  for (const line of plan ? planLines(plan) : []) {
+    for (let i = 1; i < line.length; i++) quads.pushLine(at(line[i - 1]), at(line[i]), PLAN_WIDTH_M, PLAN);
+  }
+  return { bytes: quads.bytes, count: quads.count };
+}
+
+// A cross at a point of the ego frame, or null.
+export function probeQuads(at) {
+  const quads = new QuadList(2);
+  for (const side of at ? [-PROBE_M, PROBE_M] : []) {
+    const [from, to] = [[at.x - PROBE_M, at.y - side, PROBE_Z_M], [at.x + PROBE_M, at.y + side, PROBE_Z_M]];
+    quads.pushLine(from, to, RING_WIDTH_M, PROBE);
+  }
   return { bytes: quads.bytes, count: quads.count };
 }

@@ -2,6 +2,7 @@
 // of the shown layer; safe paths, road, trail, colours, rate. In: settings, the vehicle's layers, the newest frame.
 // Out: changed settings, and the legend of what is shown.
 
+import { isQuiet } from "../draw/paint.js";
 import { css, scaleGradient } from "../draw/palette.js";
 import { percent, setText, words } from "../text.js";
 
@@ -16,6 +17,8 @@ export class Layers {
   #names = "";
   #channels = "";
   #legend = "";
+  // What the classes say, and what a planner may do by their meanings (/classes.json).
+  #classes = {};
 
   // changed(): the settings have changed.
   constructor(part, settings, changed) {
@@ -29,6 +32,11 @@ export class Layers {
     part("max_rate_hz").value = String(settings.max_rate_hz);
     part("max_rate_hz").onchange = () => this.#set({ max_rate_hz: Number(part("max_rate_hz").value) });
     part("channel").onchange = () => this.#set({ channel: part("channel").value });
+  }
+
+  explain(classes) {
+    this.#classes = classes;
+    this.#legend = "";
   }
 
   writeNames(names) {
@@ -73,8 +81,9 @@ export class Layers {
     const is_awaited = shown !== undefined && shown !== chosen && this.#names.split(",").includes(chosen);
     const text = is_awaited ? `${words(chosen)} comes with the next map; this is ${words(shown)}` : "";
     setText(this.#part("awaited"), text);
+    setText(this.#part("shown"), words(shown ?? "Legend"));
     this.#writeScale(frame?.bar ?? null);
-    this.#writeLegend(frame?.legend ?? []);
+    this.#writeLegend(shown, frame?.legend ?? []);
   }
 
   #set(changes) {
@@ -104,20 +113,35 @@ export class Layers {
     texts.forEach((text, i) => setText(labels.children[i], text));
   }
 
-  #writeLegend(entries) {
-    const legend = this.#part("legend"), key = entries.map(([colour, text]) => `${colour} ${text}`).join();
+  // A press says what the pointer is told: a finger has none.
+  #writeLegend(layer, entries) {
+    const legend = this.#part("legend");
+    const key = [layer, ...entries.map(([colour, text]) => `${colour} ${text}`)].join();
     if (key !== this.#legend) {
       this.#legend = key;
+      setText(this.#part("says"), "");
       legend.replaceChildren(...entries.map(([colour, text, , meaning]) => {
-        const [entry, swatch, share] = ["li", "i", "b"].map((tag) => document.createElement(tag));
+        const [entry, button, swatch, share] = ["li", "button", "i", "b"].map((tag) => document.createElement(tag));
         if (colour) swatch.style.background = css(colour);
-        if (meaning) entry.title = `Means ${meaning} to a planner`;
-        entry.append(...(colour ? [swatch] : []), text, share);
+        swatch.classList.toggle("quiet", isQuiet(meaning));
+        button.type = "button";
+        button.title = saysOf(this.#classes, layer, text, meaning);
+        button.onclick = () => setText(this.#part("says"), button.title && `${text}: ${button.title}`);
+        button.append(...(colour ? [swatch] : []), text, share);
+        entry.append(button);
         return entry;
       }));
     }
     entries.forEach(([, , share], i) => {
-      setText(legend.children[i].lastChild, share === undefined ? "" : percent(share, 0));
+      setText(legend.children[i].firstChild.lastChild, shareText(share));
     });
   }
+}
+
+const shareText = (share) => (!share ? "" : share < 0.005 ? "< 1 %" : percent(share, 0));
+
+// What a class says, and what a planner may do there.
+export function saysOf({ layers, meanings }, layer, text, meaning) {
+  const says = layers?.[layer]?.[text.replaceAll(" ", "_")], may = meanings?.[meaning];
+  return [says, may && `A planner may ${may}.`].filter(Boolean).join(" ");
 }

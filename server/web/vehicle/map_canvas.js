@@ -3,7 +3,7 @@
 // view() after each change of the view or the size, probe({ x, y } or null).
 
 import { drawOutline, drawPlan, drawProbe, drawRings, drawSafePoints, drawTrail } from "../draw/overlay.js";
-import { fit, moveInto, pan, place, rasterOf, toEgo, zoomAt } from "./view.js";
+import { ahead, fit, moveInto, pan, place, rasterOf, toEgo, zoomAt } from "./view.js";
 
 // More pixels a side show no more of a grid, and cost time for each map.
 const PIXELS_MAX = 1200;
@@ -19,8 +19,8 @@ export class MapCanvas {
   #on;
   #picture = document.createElement("canvas");
   #frame = null;
-  // Radius that the view is fitted to until the user moves it; null afterwards.
-  #fitted_m = 0;
+  // "ahead" or "all" until the user moves the view; null afterwards.
+  #home = "ahead";
   #is_scheduled = false;
   #layers = { outline: [], trail: [], pose: null, safe_points: null, plan: null };
 
@@ -46,16 +46,17 @@ export class MapCanvas {
       this.#picture.height = raster.height;
       const image = new ImageData(new Uint8ClampedArray(pixels.buffer), raster.width, raster.height);
       this.#picture.getContext("2d").putImageData(image, 0, 0);
-      if (this.#fitted_m !== null && this.#fitted_m !== frame.radius_m) this.#fit(frame.radius_m);
     }
     this.#frame = frame;
+    this.#goHome();
     this.#layers = layers;
     this.draw();
   }
 
-  // Shows all of the grid again.
+  // Shows what is ahead, or all of the grid if that is shown already.
   reset() {
-    if (this.#frame) this.#fit(this.#frame.radius_m);
+    this.#home = this.#home === "ahead" ? "all" : "ahead";
+    this.#goHome();
     this.schedule();
   }
 
@@ -64,7 +65,8 @@ export class MapCanvas {
   }
 
   forgetView() {
-    this.#fitted_m = 0;
+    this.#home = "ahead";
+    this.#goHome();
     this.probe = null;
   }
 
@@ -101,25 +103,28 @@ export class MapCanvas {
     this.size = { width, height };
     this.#canvas.width = Math.round(width * devicePixelRatio);
     this.#canvas.height = Math.round(height * devicePixelRatio);
-    if (this.#fitted_m) this.view = fit(this.#fitted_m, this.size);
+    this.#goHome();
     this.#on.view();
     this.schedule();
   }
 
-  #fit(radius_m) {
-    this.#fitted_m = radius_m;
-    this.view = fit(radius_m, this.size);
+  #goHome() {
+    if (this.#home === null) return;
+    const radius_m = this.#home === "all" ? this.#frame?.radius_m : null;
+    const view = radius_m ? fit(radius_m, this.size) : ahead(this.size);
+    if (view.metres === this.view.metres && view.x_m === this.view.x_m && view.y_m === this.view.y_m) return;
+    this.view = view;
     this.#on.view();
   }
 
   #move(view) {
-    this.#fitted_m = null;
+    this.#home = null;
     this.view = view;
     this.#on.view();
     this.schedule();
   }
 
-  #moveProbe(probe) {
+  moveProbe(probe) {
     this.probe = probe;
     this.#on.probe(probe);
     this.schedule();
@@ -150,7 +155,7 @@ export class MapCanvas {
     canvas.onpointermove = (event) => {
       const now = this.#at(event), before = pointers.get(event.pointerId);
       if (!before) {
-        if (event.pointerType === "mouse") this.#moveProbe(toEgo(this.view, this.size, now.px, now.py));
+        if (event.pointerType === "mouse") this.moveProbe(toEgo(this.view, this.size, now.px, now.py));
         return;
       }
       const [dx, dy] = [now.px - before.px, now.py - before.py];
@@ -167,9 +172,9 @@ export class MapCanvas {
     canvas.onpointerup = canvas.onpointercancel = (event) => {
       const at = pointers.get(event.pointerId);
       pointers.delete(event.pointerId);
-      if (at && !is_dragged && event.type === "pointerup") this.#moveProbe(toEgo(this.view, this.size, at.px, at.py));
+      if (at && !is_dragged && event.type === "pointerup") this.moveProbe(toEgo(this.view, this.size, at.px, at.py));
     };
-    canvas.onpointerleave = (event) => event.pointerType === "mouse" && !pointers.size && this.#moveProbe(null);
+    canvas.onpointerleave = (event) => event.pointerType === "mouse" && !pointers.size && this.moveProbe(null);
     canvas.ondblclick = (event) => {
       const { px, py } = this.#at(event);
       this.#move(zoomAt(this.view, this.size, px, py, 2));
@@ -182,7 +187,7 @@ export class MapCanvas {
     const by = { ArrowUp: [step, 0], ArrowDown: [-step, 0], ArrowLeft: [0, step], ArrowRight: [0, -step] }[event.key];
     const act = {
       "+": () => this.zoom(ZOOM_KEY), "=": () => this.zoom(ZOOM_KEY), "-": () => this.zoom(1 / ZOOM_KEY),
-      0: () => this.reset(), Escape: () => this.#moveProbe(null),
+      0: () => this.reset(), Escape: () => this.moveProbe(null),
     }[event.key];
     if (!by && !act) return;
     event.preventDefault();
@@ -190,6 +195,6 @@ export class MapCanvas {
     const { x, y } = this.probe ?? { x: 0, y: 0 }, probe = { x: x + by[0], y: y + by[1] };
     const view = moveInto(this.view, this.size, probe);
     if (view.x_m !== this.view.x_m || view.y_m !== this.view.y_m) this.#move(view);
-    this.#moveProbe(probe);
+    this.moveProbe(probe);
   }
 }

@@ -1,7 +1,7 @@
 // The view of one vehicle. In: its frames, cells and status. Out: the large map, its age, its state, plots and tables,
 // and what is wanted of the Worker. The age of the shown map grows by the server's clock whether maps arrive or not.
 
-import { freshness } from "../clock.js";
+import { behind, freshness } from "../clock.js";
 import * as metrics from "../metrics.js";
 import { bearing, bytes, dash, duration, setText, words } from "../text.js";
 import { wantOf } from "../settings.js";
@@ -17,6 +17,8 @@ const RATE_OVER_MS = 3000;
 // Ages are written ten times a second, which a reader can follow; each text costs the browser a layout.
 const AGE_EVERY_MS = 100;
 const METRICS_EVERY_MS = 500, SAMPLE_EVERY_MS = 1000;
+// How reasons of the server begin that stand beside the age, or in the bar of a replay.
+const SAID = ["the newest map is ", "the replay is ", "maps are replayed with "];
 const HINT = "Point at a cell, tap it, or use the arrow keys on the map.";
 
 const $ = (id) => document.getElementById(id);
@@ -60,7 +62,7 @@ export class VehicleView {
     };
     this.#layers = new Layers(part, settings, draw);
     const ask = (request) => this.#post({ type: "server", request: { type: "points", ...request } });
-    this.#space = new Space(settings, draw, ask);
+    this.#space = new Space(settings, draw, ask, (at) => this.#map.moveProbe(at));
     const shown = () => (this.#space.is_open ? this.#space : this.#map);
     this.#map = new MapCanvas($("map"), {
       view: () => this.#wantSoon(),
@@ -69,6 +71,8 @@ export class VehicleView {
         if (!at) this.#writeCell(null);
       },
     });
+    // A phone shows two lines of them.
+    $("reasons").onclick = () => $("reasons").classList.toggle("whole");
     $("zoom-in").onclick = () => shown().zoom(1.5);
     $("zoom-out").onclick = () => shown().zoom(1 / 1.5);
     $("zoom-all").onclick = () => shown().reset();
@@ -146,6 +150,11 @@ export class VehicleView {
     setText($("refusal"), text);
   }
 
+  // classes: of /classes.json.
+  explain(classes) {
+    this.#layers.explain(classes);
+  }
+
   // A key that was pressed anywhere on the page; true if it means something here.
   pressKey(key) {
     if (!/^[1-9]$/.test(key)) return false;
@@ -218,7 +227,9 @@ export class VehicleView {
     $("bar").style.transform = `scaleX(${age ? share.toFixed(2) : 0})`;
     setText($("age"), age && state !== "recorded" ? duration(age.age_ms) : dash);
     const valid = age && `valid for ${duration(age.validity_ms)} after capture`;
-    const why = state === "recorded" ? "replayed with the stamps of the recording" : age?.why || valid;
+    const told_ms = performance.now() - this.#status_arrived_ms;
+    const late = age && behind(age.age_ms, this.#status?.map_age_ms, told_ms, age.validity_ms);
+    const why = state === "recorded" ? "replayed with the stamps of the recording" : late || age?.why || valid;
     setText($("why"), age ? why : "waiting for the first map");
     setText($("stale"), state === "stale" ? `STALE · ${duration(age.age_ms)}` : "");
   }
@@ -241,7 +252,9 @@ export class VehicleView {
     const pose = shown?.header.map_from_ego;
     $("heading").parentElement.hidden = !pose;
     setText($("heading"), pose ? `${(Math.round((yawOf(pose) * 180) / Math.PI) + 360) % 360}°` : "");
-    const { state, reasons } = stateOf(status);
+    const { state, reasons: all } = stateOf(status);
+    const is_said = (reason) => !age?.fresh && SAID.some((begin) => reason.startsWith(begin));
+    const reasons = all.filter((reason) => !is_said(reason));
     $("state").hidden = !state;
     for (const part of ["state", "reasons"]) $(part).dataset.state = state ?? "";
     setText($("state"), state ? state.toUpperCase() : "");

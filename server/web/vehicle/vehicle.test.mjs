@@ -4,7 +4,8 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { History, lines, niceTop, SPAN_MS } from "./history.js";
-import { egoFrom, fit, moveInto, pan, place, rasterOf, toEgo, toPixel, Trail, zoomAt } from "./view.js";
+import { saysOf } from "./layers.js";
+import { ahead, egoFrom, fit, moveInto, pan, place, rasterOf, toEgo, toPixel, Trail, zoomAt } from "./view.js";
 
 const SIZE = { width: 800, height: 400 };
 const near = (a, b) => assert.ok(Math.abs(a - b) < 1e-9, `${a} and ${b}`);
@@ -29,6 +30,22 @@ test("forward is up, left is left, and a drag moves the picture with the finger"
   near(moved.px, 430);
   near(moved.py, 180);
   assert.equal(pan(view, 1e9, 0).y_m, 200, "the vehicle is never lost");
+});
+
+test("the map opens with 30 m ahead and 15 m behind, the vehicle low in the picture", () => {
+  for (const size of [SIZE, { width: 370, height: 370 }, { width: 300, height: 900 }]) {
+    const view = ahead(size), side = Math.min(size.width, size.height);
+    near(toPixel(view, size, 30, 0).py, (size.height - side) / 2);
+    near(toPixel(view, size, -15, 0).py, (size.height + side) / 2);
+  }
+});
+
+test("a class says what it is and what a planner may do there", () => {
+  const classes = { layers: { speed: { not_reached: "Even enough." } }, meanings: { "not reached": "not drive there" } };
+  const says = (layer, text) => saysOf(classes, layer, text, "not reached");
+  assert.equal(says("speed", "not reached"), "Even enough. A planner may not drive there.");
+  assert.equal(says("other", "not reached"), "A planner may not drive there.");
+  assert.equal(saysOf({}, "speed", "plan tester", undefined), "", "before the words have come");
 });
 
 test("a raster covers the canvas, and keeps its place when the view moves", () => {

@@ -9,6 +9,14 @@ const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 export const fit = (radius_m, { width, height }) =>
   ({ x_m: 0, y_m: 0, metres: clamp((2.04 * radius_m) / Math.max(Math.min(width, height), 1), METRES_MIN, METRES_MAX) });
 
+// Shows AHEAD_M before the vehicle and BEHIND_M behind it, as a driver looks: the vehicle is low in the picture.
+const AHEAD_M = 30, BEHIND_M = 15;
+
+export const ahead = ({ width, height }) => {
+  const metres = (AHEAD_M + BEHIND_M) / Math.max(Math.min(width, height), 1);
+  return { x_m: (AHEAD_M - BEHIND_M) / 2, y_m: 0, metres: clamp(metres, METRES_MIN, METRES_MAX) };
+};
+
 export const toEgo = (view, { width, height }, px, py) =>
   ({ x: view.x_m + (height / 2 - py) * view.metres, y: view.y_m + (width / 2 - px) * view.metres });
 
@@ -57,6 +65,22 @@ export const yawOf = ({ qx, qy, qz, qw }) => Math.atan2(2 * (qw * qz + qx * qy),
 export function egoFrom(pose, { x, y }) {
   const yaw = yawOf(pose), [dx, dy] = [x - pose.x, y - pose.y];
   return { x: dx * Math.cos(yaw) + dy * Math.sin(yaw), y: dy * Math.cos(yaw) - dx * Math.sin(yaw) };
+}
+
+// Half the width of the cross at a plan's goal.
+const GOAL_M = 0.75;
+
+// The lines of a plan (of a MapUpdate), each a list of [x, y] in the ego frame: its path, its footprint at the end, and
+// a cross at its goal.
+export function planLines({ x, y, heading_rad, footprint_m, goal }) {
+  const end = x.length - 1, [sin, cos] = [Math.sin(heading_rad[end]), Math.cos(heading_rad[end])], footprint = [];
+  for (let i = 0; i < footprint_m.length; i += 2) {
+    const [forward, left] = [footprint_m[i], footprint_m[i + 1]];
+    footprint.push([x[end] + cos * forward - sin * left, y[end] + sin * forward + cos * left]);
+  }
+  const cross = (side) => [[goal.x - GOAL_M, goal.y - side], [goal.x + GOAL_M, goal.y + side]];
+  const path = Array.from(x, (x, i) => [x, y[i]]);
+  return [path, [...footprint, ...footprint.slice(0, 1)], ...(goal ? [cross(-GOAL_M), cross(GOAL_M)] : [])];
 }
 
 // Where a vehicle was, a point every STEP_M. A jump begins again: another frame, or a replay.

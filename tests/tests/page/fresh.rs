@@ -56,11 +56,12 @@ pub fn the_page_shows_a_fresh_map() {
     println!("fresh in {fresh} of {looks} looks\n{}", browser.text("#stream"));
     println!("age by display frame, p50, p90, p99: {} ms", browser.run(AGES));
     browser.screenshot("vehicle-1440x900");
-    // Safe paths are drawn, unless the reader does not want them.
+    // Safe paths are drawn if the reader wants them.
+    assert_eq!(browser.run(PATH_PIXELS), 0);
+    browser.run("document.querySelector('[data-part=safe_points]').click()");
     browser.until("safe paths", &format!("const n = (() => {{ {PATH_PIXELS} }})(); return n > 0"));
     browser.run("document.querySelector('[data-part=safe_points]').click()");
     browser.until("no safe paths", &format!("const n = (() => {{ {PATH_PIXELS} }})(); return n === 0"));
-    browser.run("document.querySelector('[data-part=safe_points]').click()");
     each_layer_can_be_shown(&browser);
     let errors = browser.console_errors();
     drop(browser);
@@ -100,6 +101,8 @@ fn looks_well_on_a_phone(demo: &RunningDemo) {
     phone.screenshot("vehicle-390x844");
     let width = phone.run("return document.documentElement.scrollWidth");
     assert_eq!(width, 390, "nothing is wider than the phone");
+    let end = phone.run("return document.querySelector('.legend').getBoundingClientRect().bottom + scrollY");
+    assert!(end.as_f64().is_some_and(|end| end < 844.0), "the legend is on the first screen: {end}");
     assert_eq!(phone.console_errors(), Vec::<String>::new());
 }
 

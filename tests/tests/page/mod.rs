@@ -37,6 +37,7 @@ in_a_browser! {
     the_page_beside_the_demo_shows_a_fresh_map => fresh::the_page_shows_a_fresh_map,
     a_drive_is_shown_in_3d_with_its_points => space::a_drive_is_shown_in_3d,
     a_cell_on_the_page_has_the_values_that_a_client_reads => replayed::cells_are_those_of_the_client,
+    a_viewed_drive_opens_at_its_first_map_and_shows_any_layer_of_it => replayed::a_viewed_drive_opens_at_its_first_map,
     a_viewed_drive_is_recorded_and_not_stale_and_steps => replayed::a_viewed_drive_steps,
     a_plan_is_drawn_over_the_map => replayed::a_plan_is_drawn,
     the_time_bar_steps_and_seeks_a_replay => replayed::the_time_bar_controls_a_replay,

@@ -163,27 +163,62 @@ impl Drop for Viewing {
     }
 }
 
-pub fn a_viewed_drive_steps() {
+/// Runs `test` with a browser beside `clearway view`.
+fn beside_a_view(arguments: &[&str], test: impl FnOnce(&Browser)) {
     let mut command = Command::new(clearway_tests::binaries().join("clearway"));
-    command.arg("view").arg(town()).args(["--from", "0.45"]).stdin(Stdio::null()).stdout(Stdio::piped());
+    command.arg("view").arg(town()).args(arguments).stdin(Stdio::null()).stdout(Stdio::piped());
     let mut viewing = Viewing(command.spawn().expect("the command starts"));
     let mut page = String::new();
     BufReader::new(viewing.0.stdout.take().expect("a pipe")).read_line(&mut page).expect("an address");
     let browser = Browser::start(1440, 900);
     browser.open(page.trim());
     browser.until("the time bar", "return !document.getElementById('replay').hidden");
+    test(&browser);
+    assert_eq!(browser.console_errors(), Vec::<String>::new());
+}
+
+pub fn a_viewed_drive_opens_at_its_first_map() {
+    beside_a_view(&[], |browser| {
+        let legend = |words: &str| {
+            let script = "return document.querySelector('.legend').textContent.includes('WORDS')";
+            browser.until(words, &script.replace("WORDS", words));
+        };
+        legend("not reached");
+        let begin = "return document.querySelector('[data-part=time]').textContent.startsWith('0.')";
+        browser.until("the begin", begin);
+        let is_ok = "return document.getElementById('state').textContent === 'OK'";
+        browser.until("no warning of a pause that the user asked for", is_ok);
+        browser.key("body", "3");
+        legend("flat inferred");
+        browser.click("#space-button");
+        let in_3d = "return /cells (in|lie)/.test(document.getElementById('space-text').textContent)";
+        browser.until("the map in 3-D", in_3d);
+        let words = "return document.querySelector('.legend button').title";
+        let unknown = "No point fell into the cell, or too few to judge it, and it lies in no flat region. \
+                       A planner may not drive there.";
+        assert_eq!(browser.run(words), unknown);
+        browser.key("body", "?");
+        browser.until("the keys", "return document.getElementById('keys').open");
+        browser.screenshot("keys-1440x900");
+    });
+}
+
+pub fn a_viewed_drive_steps() {
+    beside_a_view(&["--from", "0.45"], steps);
+}
+
+fn steps(browser: &Browser) {
     browser.until("a pause", "return document.querySelector('[data-part=play]').textContent === 'Play'");
     browser.until("a map", "return /^\\d+$/.test(document.querySelector('#stream dd')?.textContent)");
     let first: u64 = browser.text("#stream dd").parse().expect("a sequence");
     browser.click("[data-part=step]");
-    await_map(&browser, first + 1);
+    await_map(browser, first + 1);
     let shown = "return [document.body.dataset.map, document.getElementById('freshness').textContent,
         document.getElementById('stale').textContent]";
     browser.until("the state", "return document.body.dataset.map === 'recorded'");
     assert_eq!(browser.run(shown), serde_json::json!(["recorded", "RECORDED", ""]));
     browser.run(ALL_LAYERS);
     browser.click("[data-part=step]");
-    await_map(&browser, first + 2);
+    await_map(browser, first + 2);
     browser.screenshot("view-1440x900");
-    assert_eq!(browser.console_errors(), Vec::<String>::new());
 }

@@ -263,10 +263,10 @@ impl Engine {
         self.wires.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
     }
 
-    /// Makes the pipeline compute the layers that have subscribers. While it records it computes all layers, because a
-    /// replay does not have the readers of the recorded run.
+    /// Makes the pipeline compute the layers that have subscribers. While maps are recorded it computes all layers,
+    /// because a replay does not have the readers of the recorded run.
     fn update_layers(&mut self) {
-        let all = self.recording.as_ref().is_some_and(RecordingHandle::is_recording);
+        let all = self.recording.as_ref().is_some_and(RecordingHandle::records_maps);
         let subscriptions = &self.wires.subscriptions;
         self.pipeline.set_active_layers(|layer| all || subscriptions.is_subscribed(layer));
     }

@@ -1,7 +1,8 @@
-//! The HTTP server of the page: its embedded files, its WebSocket `/live` ([`super::page_live`]), `/vehicles`,
-//! `/healthz`, `/readyz` and `/metrics`. The last three are also served alone, on a listener of their own.
+//! The HTTP server of the page: its embedded files, what the classes say (`/classes.json`), its WebSocket `/live`
+//! ([`super::page_live`]), `/vehicles`, `/healthz`, `/readyz` and `/metrics`. The last three are also served alone, on
+//! a listener of their own.
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Instant;
 
 use axum::Router;
@@ -11,7 +12,7 @@ use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use rust_embed::RustEmbed;
-use serde_json::Value;
+use serde_json::{Map, Value, json};
 
 use super::listen::access::Caller;
 use super::listen::{CallPermit, Listener, ListenerHandle, READ_BUFFER_BYTES};
@@ -36,6 +37,39 @@ struct Assets;
 #[prefix = "wire/"]
 struct Decoder;
 
+/// The documents with a table of the classes, by layer.
+const LAYERS: [(&str, &str); 7] = [
+    ("drivability", include_str!("../../../core/mapping/src/layer/drivability/README.md")),
+    ("height_difference", include_str!("../../../core/mapping/src/layer/height_difference/README.md")),
+    ("terrain", include_str!("../../../core/mapping/src/layer/terrain/README.md")),
+    ("occupancy", include_str!("../../../core/mapping/src/layer/occupancy/README.md")),
+    ("speed", include_str!("../../../core/mapping/src/layer/speed/README.md")),
+    ("safe_path", include_str!("../../../core/mapping/src/layer/safe_path/README.md")),
+    ("freespace", include_str!("../../../core/mapping/src/layer/freespace/README.md")),
+];
+/// The document with a table of the meanings.
+const MEANINGS: &str = include_str!("../../../../client/README.md");
+
+/// JSON: `layers`, what each class of each layer says, and `meanings`, what a planner may do by each meaning.
+static CLASSES: LazyLock<String> = LazyLock::new(|| {
+    let classes = |document: &str| -> Map<String, Value> {
+        let says = |row: Vec<&str>| Some((row.first()?.replace('`', ""), (*row.last()?).into()));
+        rows(document, "| class |").filter_map(says).collect()
+    };
+    let of_layer = |(name, document): &(&str, &str)| ((*name).to_owned(), classes(document).into());
+    let layers: Map<String, Value> = LAYERS.iter().map(of_layer).collect();
+    let may = |row: Vec<&str>| Some(((*row.first()?).to_owned(), (*row.get(1)?).into()));
+    let meanings: Map<String, Value> = rows(MEANINGS, "| meaning |").filter_map(may).collect();
+    json!({ "layers": layers, "meanings": meanings }).to_string()
+});
+
+/// The cells of each row of the first table in a document whose header begins so.
+fn rows<'a>(document: &'a str, header: &'a str) -> impl Iterator<Item = Vec<&'a str>> {
+    let table = document.lines().skip_while(move |line| !line.starts_with(header)).skip(2);
+    let cells = |line: &'a str| line.trim_matches('|').split('|').map(str::trim).collect();
+    table.take_while(|line| line.starts_with('|')).map(cells)
+}
+
 /// What is served: the vehicles, the counts of the listeners by name, and the replay if there is one.
 #[derive(Clone)]
 pub struct Shown {
@@ -55,7 +89,8 @@ pub struct Shown {
 
 /// Serves the page until `stop` resolves.
 pub async fn serve(listener: Listener, shown: Shown, stop: impl Future<Output = ()>) {
-    let router = metrics_routes().route("/live", get(live)).route("/vehicles", get(list)).fallback(asset);
+    let router = metrics_routes().route("/live", get(live)).route("/vehicles", get(list));
+    let router = router.route("/classes.json", get(classes)).fallback(asset);
     listener.serve(router.with_state(shown), stop).await;
 }
 
@@ -81,6 +116,10 @@ async fn asset(uri: Uri) -> Response {
         }
         None => (StatusCode::NOT_FOUND, format!("nothing at {}\n", uri.path())).into_response(),
     }
+}
+
+async fn classes() -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "application/json"), (header::CACHE_CONTROL, "no-cache")], CLASSES.as_str())
 }
 
 async fn list(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
@@ -139,4 +178,41 @@ async fn live(
     upgrade.on_upgrade(async move |socket| {
         call.slot.closing.run_until_cancelled(live.serve(socket, &call.slot)).await;
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use clearway_mapping::layer::ClassInfo;
+    use clearway_mapping::layer::drivability::class::DrivabilityClass;
+    use clearway_mapping::layer::freespace::class::FreespaceClass;
+    use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
+    use clearway_mapping::layer::occupancy::class::OccupancyClass;
+    use clearway_mapping::layer::safe_path::class::SafePathClass;
+    use clearway_mapping::layer::speed::class::SpeedClass;
+    use clearway_mapping::layer::terrain::class::TerrainClass;
+
+    use super::*;
+
+    #[test]
+    fn the_page_has_words_for_every_class_and_every_meaning() {
+        let classes: Value = serde_json::from_str(&CLASSES).unwrap();
+        let legends: [(&str, &[ClassInfo]); 7] = [
+            ("drivability", DrivabilityClass::LEGEND),
+            ("height_difference", HeightDifferenceClass::LEGEND),
+            ("terrain", TerrainClass::LEGEND),
+            ("occupancy", OccupancyClass::LEGEND),
+            ("speed", SpeedClass::LEGEND),
+            ("safe_path", SafePathClass::LEGEND),
+            ("freespace", FreespaceClass::LEGEND),
+        ];
+        for (layer, legend) in legends {
+            let said = classes["layers"][layer].as_object().unwrap();
+            let names: Vec<_> = legend.iter().map(|class| class.name).collect();
+            assert!(names.iter().all(|name| said[*name].as_str().unwrap().ends_with('.')), "{layer}: {said:?}");
+            assert_eq!(said.len(), names.len(), "{layer}: {said:?}");
+        }
+        let meanings = classes["meanings"].as_object().unwrap();
+        assert_eq!(meanings["not reached"], "not drive there: it is ground, but no way to it was found");
+        assert_eq!(meanings.len(), 7);
+    }
 }

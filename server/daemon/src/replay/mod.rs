@@ -145,6 +145,11 @@ impl ReplayRun {
         &self.summary.mount
     }
 
+    /// Controls the replay.
+    pub fn handle(&self) -> ReplayHandle {
+        self.handle.clone()
+    }
+
     /// Replays the files to their end. A served replay returns only after `stop` has resolved, unless it exits at its
     /// end. Every replay ends early if `stop` resolves.
     ///

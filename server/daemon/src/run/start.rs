@@ -132,9 +132,9 @@ impl Running {
         let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
         let layers = layer_names(&vehicle.maps);
         let wires = Wires::new(&layers).with_plans((!is_stepped).then(|| queue.clone()), queue.drops());
-        let status = VehicleStatus::new(name.clone(), boot_id, layers, queue.drops());
+        let status = VehicleStatus::new(name.clone(), boot_id, layers, queue.drops()).with_traces(self.traces.clone());
         status.show_queue(queue.space());
-        let status = Arc::new(status.with_outline(vehicle.body.as_ref()).with_traces(self.traces.clone()));
+        let status = Arc::new(status.with_outline(vehicle.body.as_ref(), vehicle.maps.reach.outline()));
         let (newest, receiver) = watch::channel(None);
         let engine = Engine {
             pipeline,

@@ -258,7 +258,10 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
     }
     let standing = standing(facts);
     let stands = standing.is_some();
-    standing.into_iter().for_each(|why| add(State::Warn, why));
+    // A pause is what a user asked for, and so is what follows from it.
+    let is_paused = matches!(facts.replay, Some((ReplayPhase::Paused, _)));
+    let warn = if is_paused { State::Ok } else { State::Warn };
+    standing.into_iter().for_each(|why| add(warn, why));
     let Some(age) = facts.map_age else {
         if expects_data(facts) {
             add(State::Error, "no map yet".to_owned());
@@ -266,11 +269,11 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
         return;
     };
     if facts.has_recorded_stamps {
-        add(State::Warn, "maps are replayed with the stamps of the recording: readers call them stale".to_owned());
+        add(warn, "maps are replayed with the stamps of the recording: readers call them stale".to_owned());
     }
     // A replay that stands still does what it was asked to do.
     let is_long = !stands && age.max(facts.not_fresh_for) > facts.validity + STALE_ERROR_AFTER;
-    let state = if is_long { State::Error } else { State::Warn };
+    let state = if is_long { State::Error } else { warn };
     // A map with the stamp of the recording does not age while the replay stands still.
     if age > facts.validity && (expects_data(facts) || !facts.has_recorded_stamps) {
         add(state, format!("the newest map is {} old, and valid for {}", seconds(age), seconds(facts.validity)));

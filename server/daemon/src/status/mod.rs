@@ -24,7 +24,7 @@ mod message;
 mod metrics;
 pub mod network;
 mod notices;
-mod process;
+pub mod process;
 mod reasons;
 mod text_format;
 pub mod transports;

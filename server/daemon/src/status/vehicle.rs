@@ -9,6 +9,7 @@ use clearway_mapping::config::BodyConfig;
 use clearway_mapping::error::EventError;
 use clearway_mapping::ledger::Ledger;
 use clearway_mapping::pipeline::NamedStatus;
+use clearway_mapping::vehicle_outline::Outline;
 use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
@@ -208,15 +209,14 @@ impl VehicleStatus {
         }
     }
 
-    /// Adds the outline of the vehicle.
-    pub fn with_outline(self, body: Option<&BodyConfig>) -> Self {
-        let corners = |body: &BodyConfig| {
-            let BodyConfig { x_m_min, x_m_max, y_m_min, y_m_max, .. } = *body;
-            let corners = [x_m_max, y_m_min, x_m_max, y_m_max, x_m_min, y_m_max, x_m_min, y_m_min];
-            // The shortest decimal: 0.1 stays 0.1.
-            corners.iter().map(|m| m.to_string().parse().unwrap_or(f64::from(*m))).collect()
-        };
-        Self { outline_m: body.map_or_else(Vec::new, corners), ..self }
+    /// Adds the outline of the vehicle: the body's, else the reach's.
+    pub fn with_outline(self, body: Option<&BodyConfig>, reach: Outline) -> Self {
+        let of_body = |body: &BodyConfig| [body.x_m_max, body.y_m_min, body.x_m_min, body.y_m_max];
+        let side_m = reach.width_m / 2.0;
+        let [front, right, rear, left] = body.map_or([reach.front_m, -side_m, -reach.rear_m, side_m], of_body);
+        // The shortest decimal: 0.1 stays 0.1.
+        let exact = |m: f32| m.to_string().parse().unwrap_or(f64::from(m));
+        Self { outline_m: [front, right, front, left, rear, left, rear, right].map(exact).into(), ..self }
     }
 
     /// Traces the maps.

@@ -6,7 +6,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -21,10 +21,13 @@ use super::rig::Rig;
 use clearway_daemon::base::clock::now_ns;
 use clearway_daemon::engine::newest::Newest;
 
+/// From one look at the sensor's newest firing to the next: short beside a revolution.
+const POLL: Duration = Duration::from_millis(2);
+
 /// A car that drives until it is stopped.
 pub struct DemoCar {
     sensors: Vec<JoinHandle<std::io::Result<Sent>>>,
-    observer: Option<JoinHandle<Result<(), ClientError>>>,
+    observer: JoinHandle<Result<(), ClientError>>,
     /// The time that each sensor, and the observations, skipped.
     skipped: Vec<Skipped>,
     halt: Arc<AtomicBool>,
@@ -36,34 +39,37 @@ pub fn address(index: usize) -> Ipv4Addr {
 }
 
 impl DemoCar {
-    /// Starts the car. Datagrams go to `data` and `telemetry`; if the rig has plane units, their scans, poses and roads
-    /// go to `grpc`. The car waits for a server whose `newest` map is late.
+    /// Starts the car of this name. Datagrams go to `data` and `telemetry`, observations to `grpc`. The car waits for a
+    /// server whose `newest` map is late.
     ///
     /// # Errors
     /// The operating system's error if it starts no thread.
     pub fn start(
+        name: &str,
         rig: Rig,
         (data, telemetry): (SocketAddr, SocketAddr),
         grpc: SocketAddr,
         newest: &watch::Receiver<Newest>,
     ) -> std::io::Result<Self> {
-        let halt = Arc::new(AtomicBool::new(false));
+        let (halt, newest_firing_ns) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicI64::new(i64::MIN)));
         let mut skipped = Vec::new();
         let mut new_skipped = || {
             skipped.push(Skipped::default());
             skipped.last().cloned().unwrap_or_default()
         };
-        let observer = if rig.units.is_empty() {
-            None
-        } else {
+        let observer = {
             let (rig, halt, skipped, progress) = (rig.clone(), halt.clone(), new_skipped(), progress(newest));
-            let runtime = tokio::runtime::Handle::current();
-            let observe = move || runtime.block_on(observe(rig, grpc, halt, progress, skipped));
-            Some(std::thread::Builder::new().name("simulated car".into()).spawn(observe)?)
+            let (runtime, name) = (tokio::runtime::Handle::current(), name.to_owned());
+            // The poses of a car with one sensor are no earlier than its packets, on a machine that is late with those.
+            let firing_ns = rig.units.is_empty().then(|| newest_firing_ns.clone());
+            let observe = move || runtime.block_on(observe(&name, rig, grpc, halt, firing_ns, progress, skipped));
+            std::thread::Builder::new().name("simulated car".into()).spawn(observe)?
         };
         let several = rig.scanners.len() > 1;
         let mut start = |(index, (name, _)): (usize, &(String, _))| {
-            let vehicle = RealTimeVehicle::new(rig.vehicle(index), progress(newest), new_skipped());
+            let firing_ns = newest_firing_ns.clone();
+            let vehicle = RealTimeVehicle::new(rig.vehicle(index), progress(newest), new_skipped())
+                .inspect(move |datagram| firing_ns.store(datagram.stamp_ns, Ordering::Relaxed));
             let own = if several { address(index) } else { Ipv4Addr::UNSPECIFIED };
             let halt = halt.clone();
             std::thread::Builder::new().name(format!("simulated {name}")).spawn(move || {
@@ -77,7 +83,7 @@ impl DemoCar {
 
     /// True if a part of the car has ended by itself, which is a fault.
     pub fn has_stopped(&self) -> bool {
-        self.sensors.iter().any(JoinHandle::is_finished) || self.observer.as_ref().is_some_and(JoinHandle::is_finished)
+        self.sensors.iter().any(JoinHandle::is_finished) || self.observer.is_finished()
     }
 
     /// Simulated time skipped so far, because the machine is too slow: that of the sensor that skipped most.
@@ -96,12 +102,9 @@ impl DemoCar {
         let ended = tokio::task::spawn_blocking(move || -> Result<Sent> {
             let mut sum = Sent::default();
             for sensor in sensors {
-                let sent = sensor.join().map_err(|_| panicked())??;
-                sum.packets += sent.packets;
-                sum.telemetry += sent.telemetry;
-                sum.device_time = sum.device_time.max(sent.device_time);
+                sum += sensor.join().map_err(|_| panicked())??;
             }
-            observer.map_or(Ok(Ok(())), JoinHandle::join).map_err(|_| panicked())??;
+            observer.join().map_err(|_| panicked())??;
             Ok(sum)
         });
         ended.await.map_err(std::io::Error::other)?.context("the simulated car")
@@ -114,15 +117,18 @@ fn progress(newest: &watch::Receiver<Newest>) -> impl Fn() -> Progress + Send + 
     move || Progress { now_ns: now_ns(), mapped_ns: newest.borrow().as_ref().map(|map| map.capture_end_ns) }
 }
 
-/// Sends each observation at the time of its stamp. Scans that are too late are skipped, not simulated.
+/// Sends each observation at the time of its stamp, and not before a firing of that time (`firing_ns`). Scans that are
+/// too late are skipped, not simulated.
 async fn observe(
+    name: &str,
     rig: Rig,
     grpc: SocketAddr,
     halt: Arc<AtomicBool>,
+    firing_ns: Option<Arc<AtomicI64>>,
     progress: impl Fn() -> Progress,
     skipped: Skipped,
 ) -> Result<(), ClientError> {
-    let mut ingester = Client::connect(&grpc.to_string()).await?.ingest("car").await?;
+    let mut ingester = Client::connect(&grpc.to_string()).await?.ingest(name).await?;
     let mut observations = rig.observations();
     let mut sent_ns = None;
     while !halt.load(Ordering::Relaxed) {
@@ -132,6 +138,10 @@ async fn observe(
         let Some(observation) = observations.next() else { break };
         let early_ns = u64::try_from(observation.stamp_ns - now_ns()).unwrap_or(0);
         tokio::time::sleep(Duration::from_nanos(early_ns)).await;
+        let is_early = |ns: &Arc<AtomicI64>| ns.load(Ordering::Relaxed) < observation.stamp_ns;
+        while firing_ns.as_ref().is_some_and(is_early) && !halt.load(Ordering::Relaxed) {
+            tokio::time::sleep(POLL).await;
+        }
         sent_ns = Some(observation.stamp_ns);
         ingester.send(observation.observation).await?;
     }

@@ -33,8 +33,10 @@ pub struct DemoReport {
 pub struct DemoSummary {
     /// The last report, with complete counts.
     pub last: DemoReport,
-    /// What the car sent.
+    /// What the cars sent.
     pub sent: Sent,
+    /// Processor time of this process over the time, the simulation's too; `None` where the system does not tell it.
+    pub cores: Option<f64>,
 }
 
 impl Default for DemoReport {
@@ -87,11 +89,11 @@ impl DemoReport {
 }
 
 impl DemoSummary {
-    /// The summary as text.
+    /// The summary as text. Its last line has the figures of the first vehicle's maps, and the cores.
     pub fn text(&self) -> String {
         let (sent, last) = (&self.sent, &self.last.snapshot);
         let mut text = format!(
-            "The car sent {} and {}; {} received, {} made.",
+            "Sent {} and {}; {} received, {} made of the first vehicle.",
             counted(sent.packets, "data packet"),
             counted(sent.telemetry, "telemetry datagram"),
             last.ledger.received,
@@ -101,7 +103,13 @@ impl DemoSummary {
             let (skipped, all) = (self.last.skipped.as_secs_f64(), self.last.elapsed.as_secs_f64());
             text += &format!("\nThe simulation skipped {skipped:.1} s of {all:.1} s: this machine was too slow.");
         }
-        text
+        let figure = |value: Option<f64>, unit: &str| value.map_or("-".into(), |value| format!("{value:.1} {unit}"));
+        text + &format!(
+            "\nlatency {} from the last packet to the map, {} a map, {} with the simulation",
+            figure(last.latency_ms_p50, "ms"),
+            figure((last.maps > 0).then_some(last.map_bytes / 1e3), "kB"),
+            figure(self.cores, "cores")
+        )
     }
 }
 
@@ -118,6 +126,15 @@ mod tests {
     fn a_line_states_that_the_map_is_stale() {
         assert!(report(300.5, 0).line().contains("age 300.5 ms STALE  latency"));
         assert!(report(299.5, 0).line().contains("age 299.5 ms  latency"));
+    }
+
+    #[test]
+    fn the_last_line_has_latency_size_and_cores() {
+        let snapshot = Snapshot { maps: 30, latency_ms_p50: Some(7.12), map_bytes: 4300.0, ..Snapshot::default() };
+        let last = DemoReport { snapshot, ..DemoReport::default() };
+        let text = DemoSummary { last, sent: Sent::default(), cores: Some(0.44) }.text();
+        let expected = "latency 7.1 ms from the last packet to the map, 4.3 kB a map, 0.4 cores with the simulation";
+        assert_eq!(text.lines().last(), Some(expected));
     }
 
     #[test]

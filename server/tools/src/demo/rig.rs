@@ -1,7 +1,7 @@
 //! A simulated car and its sensors: their part of the vehicle's configuration, and what they send.
 //!
-//! Out: datagrams of each rotating sensor ([`Rig::vehicle`]), and observations ([`Rig::observations`]): scans of the
-//! units with a few planes, ego poses and the road ahead.
+//! Out: datagrams of each rotating sensor ([`Rig::vehicle`]), and observations ([`Rig::observations`]): ego poses, and
+//! of a car with units of a few planes their scans and the road ahead.
 
 use std::time::Duration;
 
@@ -113,7 +113,8 @@ impl Rig {
 
     /// The car's observations.
     pub fn observations(&self) -> Observations<'_> {
-        let mut due = vec![(POSE_PERIOD_NS, ObservationKind::Pose), (ROAD_PERIOD_NS, ObservationKind::Road)];
+        let mut due = vec![(POSE_PERIOD_NS, ObservationKind::Pose)];
+        due.extend(self.units.first().map(|_| (ROAD_PERIOD_NS, ObservationKind::Road)));
         due.extend(
             self.units.iter().enumerate().map(|(index, (_, unit))| (unit.period_ns, ObservationKind::Scan(index))),
         );

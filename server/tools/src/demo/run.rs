@@ -1,4 +1,4 @@
-//! The demo: a server, a car that drives at it, and a report once a second.
+//! The demo: a server, a car or a fleet that drives at it, and a report once a second.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -8,12 +8,15 @@ use anyhow::{Context, Error, Result, anyhow};
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
 use clearway_sim::scenes::town;
+use clearway_sim::send::Sent;
 use clearway_sim::traffic::street;
 use tokio::time::MissedTickBehavior;
 
 use clearway_daemon::base::clock::now_ns;
-use clearway_daemon::config::{Config, Sender, Udp};
+use clearway_daemon::config::{Config, Sender, Udp, Vehicle};
 use clearway_daemon::run::{Running, Server, Setup, StartError};
+use clearway_daemon::status::process;
+use clearway_journal::RecordedMaps;
 use clearway_journal::encode::EncodedMap;
 
 use super::car::{self, DemoCar};
@@ -25,8 +28,18 @@ use crate::picture::{self, PictureStyle};
 /// How long the demo waits at its end for the last datagrams, which take far less to pass through the sockets.
 const SETTLE: Duration = Duration::from_millis(500);
 /// Greatest length of a recording in MiB, beyond which its oldest parts are deleted. Ours: a quarter of an hour with an
-/// HDL-64E. A quarter for each part, so that what is kept is never much less than what is allowed.
-const RECORDING_MIB: u64 = 2048;
+/// HDL-64E; of a black box, two minutes.
+pub const RECORDING_MIB: u64 = 2048;
+/// As [`RECORDING_MIB`], of a black box.
+pub const BLACK_BOX_MIB: u64 = 256;
+/// The names of a fleet's vehicles; further ones have numbers.
+const NAMES: [&str; 5] = ["car", "van", "truck", "bus", "shuttle"];
+/// From one vehicle of a fleet to the next along its course, in metres.
+const APART_M: f64 = 45.0;
+/// The vehicle of a fleet that fails, how long it drives, and how long it stands still then, over and over.
+const FAILING: usize = 1;
+const DRIVES: Duration = Duration::from_secs(60);
+const FAILS: Duration = Duration::from_secs(20);
 
 /// What a demo does.
 #[derive(Clone, Debug, Default)]
@@ -35,10 +48,14 @@ pub struct DemoOptions {
     pub duration: Option<Duration>,
     /// The file that events and maps are recorded to; `None`: nothing is recorded.
     pub record: Option<PathBuf>,
+    /// True if the recording is a black box: short, and without maps, which cost time and are made again from it.
+    pub black_box: bool,
     /// The file that the newest map is drawn to every second; `None`: nothing is drawn.
     pub picture: Option<PathBuf>,
     /// The car's sensors.
     pub sensors: DemoSensors,
+    /// Number of vehicles; one of several fails after a minute and comes back. 0 is 1.
+    pub vehicles: usize,
     /// True if the operating system chooses every port, for tests that run beside each other.
     pub any_port: bool,
 }
@@ -69,9 +86,10 @@ pub async fn demo(
     mut report: impl FnMut(&DemoReport),
     stop: impl Future<Output = ()>,
 ) -> Result<DemoSummary> {
-    let choice = tokio::task::block_in_place(|| SensorChoice::new(options.sensors));
-    let rig = |start_ns| rig(options.sensors, &choice, start_ns);
-    let (config, notes) = configuration(&options, &rig(0));
+    let count = options.vehicles.max(1);
+    let sensors = if count > 1 && options.sensors == DemoSensors::Auto { DemoSensors::Vlp16 } else { options.sensors };
+    let choice = tokio::task::block_in_place(|| SensorChoice::new(sensors));
+    let (config, notes) = configuration(&options, &rig(sensors, &choice, 0));
     let validity = Duration::from_millis(config.vehicles[0].maps.valid_ms.into());
     let running = Server::start(Setup { config, ..Setup::default() }).await.map_err(with_hint)?;
     let nowhere = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
@@ -79,16 +97,25 @@ pub async fn demo(
         page: running.page.unwrap_or(nowhere),
         grpc: running.grpc.unwrap_or(nowhere),
         zenoh: running.zenoh.clone(),
-        sensors: describe(options.sensors, &choice),
+        sensors: describe(sensors, &choice),
         notes,
     });
-    let udp = running.inputs[0].udp.unwrap_or((nowhere, nowhere));
     let served = running.vehicles.0[0].clone();
     // The picture and the line need these layers, whether or not a reader subscribes to them.
     let _subscription = served.wires.subscriptions.subscribe(&["freespace".to_owned(), "drivability".to_owned()]);
-    // The car starts after everything else, so that its first firing is now.
-    let car = DemoCar::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere), &served.newest)
-        .context("the simulated car")?;
+    let start = |index: usize, driven: Duration| {
+        let mut rig = rig(sensors, &choice, now_ns());
+        let drive = &mut rig.scene.drive;
+        drive.start = drive.station(driven.as_secs_f64()) + APART_M * index as f64;
+        let udp = running.inputs[index].udp.unwrap_or((nowhere, nowhere));
+        let newest = &running.vehicles.0[index].newest;
+        DemoCar::start(&name(index), rig, udp, running.grpc.unwrap_or(nowhere), newest).context("the simulated car")
+    };
+    // The cars start after everything else, so that their first firings are now.
+    let first: Result<Vec<_>> = (0..count).map(|index| start(index, Duration::ZERO).map(Some)).collect();
+    let (mut cars, mut sent) = (first?, Sent::default());
+    let cpu_s = || process::read().cpu_s;
+    let cpu_before_s = cpu_s();
 
     let began = tokio::time::Instant::now();
     let end = async {
@@ -98,12 +125,17 @@ pub async fn demo(
         }
     };
     tokio::pin!(stop, end);
-    let sensors = if options.sensors == DemoSensors::Many { "eight sensors" } else { sensors::name(choice.model) };
+    let sensors = if sensors == DemoSensors::Many { "eight sensors" } else { sensors::name(choice.model) };
     let mut last = DemoReport { validity, sensors, ..DemoReport::default() };
-    let now = |running: &Running, last: &DemoReport| {
+    let now = |running: &Running, last: &DemoReport, cars: &[Option<DemoCar>]| {
         let snapshot = running.vehicles.0[0].status.snapshot();
         let age_ms = (snapshot.maps > 0).then(|| (now_ns() - snapshot.newest_capture_end_ns) as f64 / 1e6);
-        last.next(began.elapsed(), snapshot, age_ms, car.skipped())
+        last.next(
+            began.elapsed(),
+            snapshot,
+            age_ms,
+            cars.iter().flatten().map(DemoCar::skipped).max().unwrap_or_default(),
+        )
     };
     let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
     every.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -113,8 +145,18 @@ pub async fn demo(
             () = &mut stop => break,
             () = &mut end => break,
             _ = every.tick() => {
-                last = now(&running, &last);
+                last = now(&running, &last, &cars);
                 report(&last);
+                if let Some(failing) = cars.get_mut(FAILING) {
+                    let elapsed = began.elapsed();
+                    let drives = elapsed.as_secs() % (DRIVES + FAILS).as_secs() < DRIVES.as_secs();
+                    if drives && failing.is_none() {
+                        *failing = Some(start(FAILING, elapsed)?);
+                    } else if !drives && let Some(car) = failing.take() {
+                        tracing::info!("{} fails, and comes back in {} s", name(FAILING), FAILS.as_secs());
+                        sent += car.stop().await?;
+                    }
+                }
                 let newest = served.newest.borrow().clone();
                 if let Some((map, picture)) = newest.zip(options.picture.as_deref()) {
                     let drawn = tokio::task::block_in_place(|| draw(&map, picture));
@@ -122,26 +164,38 @@ pub async fn demo(
                 }
             }
         }
-        if car.has_stopped() {
+        if cars.iter().flatten().any(DemoCar::has_stopped) {
             break;
         }
     }
-    last = now(&running, &last);
-    let sent = car.stop().await;
-    let status = running.vehicles.0[0].status.clone();
+    last = now(&running, &last, &cars);
+    let cores = cpu_s().zip(cpu_before_s).map(|(now_s, before_s)| (now_s - before_s) / last.elapsed.as_secs_f64());
+    let mut fault = None;
+    for car in cars.into_iter().flatten() {
+        match car.stop().await {
+            Ok(of_car) => sent += of_car,
+            Err(error) => fault = Some(error),
+        }
+    }
+    let vehicles = running.vehicles.clone();
     let some_are_on_the_way = || {
-        let ledger = status.snapshot().ledger;
-        let accounted = ledger.received + ledger.lost + ledger.kernel_drops;
-        sent.as_ref().is_ok_and(|sent| accounted < sent.packets + sent.telemetry)
+        let ledgers = vehicles.0.iter().map(|of| of.status.snapshot().ledger);
+        let accounted: u64 = ledgers.map(|ledger| ledger.received + ledger.lost + ledger.kernel_drops).sum();
+        accounted < sent.packets + sent.telemetry
     };
     let settled = tokio::time::Instant::now() + SETTLE;
-    while some_are_on_the_way() && tokio::time::Instant::now() < settled {
+    while fault.is_none() && some_are_on_the_way() && tokio::time::Instant::now() < settled {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     running.shutdown().await?;
-    let sent = sent?;
+    fault.map_or(Ok(()), Err)?;
     // The counts are complete only now.
-    Ok(DemoSummary { last: DemoReport { snapshot: status.snapshot(), ..last }, sent })
+    Ok(DemoSummary { last: DemoReport { snapshot: served.status.snapshot(), ..last }, sent, cores })
+}
+
+/// The name of the vehicle with this index.
+fn name(index: usize) -> String {
+    NAMES.get(index).map_or_else(|| format!("vehicle-{}", index + 1), |name| (*name).to_owned())
 }
 
 /// Draws a map's free space. A reader of the file sees a whole picture, either the old or the new one.
@@ -202,7 +256,13 @@ fn configuration(options: &DemoOptions, rig: &Rig) -> (Config, Vec<String>) {
     config.zenoh.listen = vec![format!("tcp/{zenoh}")];
     if let Some(file) = &options.record {
         config.recorder.file = file.clone();
-        (config.recorder.keep_mb, config.recorder.part_mb) = (RECORDING_MIB, RECORDING_MIB / 4);
+        let keep_mib = if options.black_box { BLACK_BOX_MIB } else { RECORDING_MIB };
+        // A quarter for each part, so that what is kept is never much less than what is allowed.
+        (config.recorder.keep_mb, config.recorder.part_mb) = (keep_mib, keep_mib / 4);
+        if options.black_box {
+            // No disk is too slow for it.
+            (config.recorder.maps, config.recorder.flush_ms) = (RecordedMaps::None, 10_000);
+        }
     }
     let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
     let many = options.sensors == DemoSensors::Many;
@@ -220,6 +280,9 @@ fn configuration(options: &DemoOptions, rig: &Rig) -> (Config, Vec<String>) {
     } else {
         vehicle.sensors[0].extrinsics = rig::extrinsics(&rig.scanners[0].1.ego_from_sensor);
     }
+    let first = vehicle.clone();
+    let other = |index| Vehicle { name: name(index), ..first.clone() };
+    config.vehicles.extend((1..options.vehicles).map(other));
     (config, notes)
 }
 

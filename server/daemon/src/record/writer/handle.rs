@@ -143,6 +143,11 @@ impl RecordingHandle {
     }
 
     /// True if maps are recorded, or will be after a warm-up: then all layers are computed.
+    pub fn records_maps(&self) -> bool {
+        self.is_recording() && self.counts.has_maps(self.vehicle)
+    }
+
+    /// True if events are recorded, or will be after a warm-up.
     pub fn is_recording(&self) -> bool {
         self.part.is_some() || self.warm_up.is_some()
     }
