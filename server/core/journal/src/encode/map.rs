@@ -18,26 +18,7 @@ use nalgebra::Isometry3;
 use prost::Message;
 
 use super::payload_cache::{PayloadCache, cropped, delta};
-
-/// How the header of a replayed map differs from that of the recorded one ([`v1::Replay`]).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Replayed {
-    /// What is added to the stamps, in ns.
-    pub shift_ns: i64,
-    /// The boot id that the map is served with.
-    pub boot_id: u64,
-    /// Recorded time of the map's event, as long as nobody knows how far the drive's stamps are behind its events: the
-    /// map's own [`lag_ns`] is added to its stamps too.
-    pub first_at_ns: Option<i64>,
-}
-
-/// Time by which a map's stamp is behind its event, in ns, in whole steps of 100 ms: what is less is the map's age.
-/// Ours: a third of the validity of a map.
-pub fn lag_ns(at_ns: i64, capture_end_ns: i64) -> i64 {
-    const STEP_NS: i64 = 100_000_000;
-    let behind_ns = at_ns.saturating_sub(capture_end_ns);
-    if behind_ns.abs() < STEP_NS { 0 } else { behind_ns.div_euclid(STEP_NS).saturating_mul(STEP_NS) }
-}
+use super::replayed::{Replayed, alter_header};
 
 /// One encoded map. A clone shares the bytes.
 #[derive(Clone, Debug, PartialEq)]
@@ -183,20 +164,6 @@ pub fn as_served_with(computed: Bytes, served: Option<v1::Header>) -> Bytes {
         alter_header(header, Replayed { shift_ns: replay.shift_ns, boot_id, first_at_ns: None });
     }
     map.encode_to_vec().into()
-}
-
-fn alter_header(header: &mut v1::Header, Replayed { shift_ns, boot_id, first_at_ns }: Replayed) {
-    let first_ns = first_at_ns.map_or(0, |at_ns| lag_ns(at_ns, header.capture_end_ns));
-    let shift_ns = shift_ns.saturating_add(first_ns);
-    let stamps = [
-        &mut header.capture_start_ns,
-        &mut header.capture_end_ns,
-        &mut header.completed_ns,
-        &mut header.valid_until_ns,
-    ];
-    stamps.into_iter().for_each(|stamp| *stamp = stamp.saturating_add(shift_ns));
-    header.replay = Some(v1::Replay { shift_ns, recorded_boot_id: header.boot_id });
-    header.boot_id = boot_id;
 }
 
 fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {

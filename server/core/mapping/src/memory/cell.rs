@@ -59,7 +59,7 @@ impl MemoryCell {
         self.ground_ns != 0 || self.obstacle_ns != 0
     }
 
-    /// The remembered point, ego frame, metres; `None` if it is out of the view of the newest map, or is no longer there.
+    /// The remembered point, ego frame, metres; `None` if it is out of the view of the newest map, or no longer there.
     pub fn recalled(
         &self,
         ego_from_map: &Isometry3<f64>,
