@@ -325,6 +325,12 @@ impl LatestSlot {
         });
     }
 
+    /// True if a map was stored.
+    #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "over gRPC the server refuses a wrong name"))]
+    pub(crate) fn has_map(&self) -> bool {
+        self.slot.borrow().newest.is_some()
+    }
+
     /// Counts a message that is not stored.
     #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "over gRPC the server itself is known"))]
     pub(crate) fn pass_over(&self, reason: Reason) {
