@@ -1,7 +1,7 @@
 //! `clearway demo`: a simulated vehicle -> a server of its own, over real UDP.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use anyhow::Result;
 use clap::Args;
@@ -52,6 +52,7 @@ async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
     let DemoArguments { seconds: duration, record, sensors, any_port } = arguments;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let picture = record.as_ref().map_or_else(|| folder.join("demo.png"), |record| record.with_extension("png"));
+    let began = SystemTime::now();
     let options = DemoOptions { duration, record: record.clone(), picture: Some(picture.clone()), sensors, any_port };
     let begun = |endpoints: &DemoEndpoints| {
         let _ = print_line(&introduction(endpoints, record.as_deref(), &picture));
@@ -61,15 +62,16 @@ async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
     };
     let summary = demo(options, begun, report, stop_signal()?).await?;
     print_line(&summary.text())?;
-    print_line(&left_behind(record.as_deref(), &picture))?;
+    print_line(&left_behind(record.as_deref(), &picture, began))?;
     Ok(())
 }
 
 /// What the demo leaves on the disk.
-fn left_behind(record: Option<&Path>, picture: &Path) -> String {
+fn left_behind(record: Option<&Path>, picture: &Path, began: SystemTime) -> String {
     let size = |path: &Path| path.metadata().map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
     let parts = record.map(clearway_daemon::record::writer::parts_of).unwrap_or_default();
-    let picture = Some(picture.to_owned()).filter(|picture| picture.exists());
+    let is_new = |picture: &PathBuf| picture.metadata().and_then(|of| of.modified()).is_ok_and(|at| at >= began);
+    let picture = Some(picture.to_owned()).filter(is_new);
     let files: Vec<String> =
         parts.iter().chain(&picture).map(|file| format!("{} ({:.1} MB)", file.display(), size(file))).collect();
     format!("left on the disk: {}", if files.is_empty() { "nothing".to_owned() } else { files.join(", ") })
