@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use clearway_client::signature::{PublicKey, SigningKey};
-use clearway_client::{ClientError, MapStream, PassedOver, StreamEvent, Update, ZenohClient, now_ns, v1};
+use clearway_client::{MapStream, PassedOver, StreamEvent, Update, ZenohClient, now_ns, v1};
 use prost::Message;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{RwLock, watch};
@@ -16,7 +16,7 @@ use crate::common::{CAPTURE_END_NS, map};
 
 const KEY: &str = "clearway/alpha/map/drivability";
 
-async fn server() -> (Session, String) {
+pub async fn server() -> (Session, String) {
     let mut config = zenoh::Config::default();
     config.insert_json5("listen/endpoints", "[\"tcp/127.0.0.1:0\"]").unwrap();
     config.insert_json5("scouting/multicast/enabled", "false").unwrap();
@@ -28,7 +28,7 @@ async fn server() -> (Session, String) {
 }
 
 /// Declares a publisher as the server does.
-async fn publisher(server: &Session) -> AdvancedPublisher<'static> {
+pub async fn publisher(server: &Session) -> AdvancedPublisher<'static> {
     let publisher = server.declare_publisher(KEY).cache(CacheConfig::default().max_samples(1));
     let misses = publisher.sample_miss_detection(MissDetectionConfig::default());
     misses.publisher_detection().await.unwrap()
@@ -76,36 +76,6 @@ async fn a_stream_starts_with_the_newest_map_and_survives_its_client() {
     publisher.put(map(40, CAPTURE_END_NS)).await.unwrap();
     publisher.put(map(44, CAPTURE_END_NS)).await.unwrap();
     assert_eq!(next(&mut maps).await, (44, 2, 0), "an old map is ignored and gaps are counted");
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_reader_that_waits_for_a_name_that_no_server_publishes_learns_which_are_published() {
-    let (server, endpoint) = server().await;
-    let _token = server.liveliness().declare_token("clearway/alpha").await.unwrap();
-    let _publisher = publisher(&server).await;
-    let client = ZenohClient::connect(&endpoint).await.unwrap();
-    for (vehicle, layer, why) in [
-        ("alpha", "fspace", "no server publishes the layer \"fspace\" of alpha now; published: drivability"),
-        ("alfa", "drivability", "no server publishes the vehicle \"alfa\" now; published: alpha"),
-    ] {
-        let maps = client.subscribe(vehicle, layer).await.unwrap();
-        let mut reasons = maps.reasons();
-        while reasons.is_empty() {
-            tokio::task::yield_now().await;
-            reasons = maps.reasons();
-        }
-        assert_eq!(reasons, [why]);
-    }
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn an_endpoint_without_a_protocol_or_without_a_router_is_named_with_what_is_needed() {
-    let error = ZenohClient::connect("localhost:7447").await.unwrap_err().to_string();
-    assert!(error.ends_with("PROTOCOL/HOST:PORT is allowed, such as tcp/localhost:7447"), "{error}");
-    let closed = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
-    let error = ZenohClient::connect(&format!("tcp/{closed}")).await.unwrap_err();
-    assert!(matches!(&error, ClientError::Unreachable { .. }), "{error}");
-    assert!(error.to_string().ends_with("no zenoh router or server accepts a connection within 5 s"), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

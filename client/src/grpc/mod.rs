@@ -111,9 +111,9 @@ impl Client {
     /// Connects to `HOST:PORT` or `https://HOST:PORT` with certificates.
     ///
     /// # Errors
-    /// [`ClientError::Address`] if the text is not an address, [`ClientError::Certificate`] if a certificate is invalid,
-    /// [`ClientError::Unreachable`] if no server answers or one side rejects the certificate of the other. The server
-    /// may reject a client's certificate only at the first call.
+    /// [`ClientError::Address`] if the text is not an address, [`ClientError::Certificate`] if a certificate is
+    /// invalid, [`ClientError::Unreachable`] if no server answers or one side rejects the certificate of the other. The
+    /// server may reject a client's certificate only at the first call.
     pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
         Self::open(address, Some(tls)).await
     }
