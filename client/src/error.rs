@@ -8,7 +8,7 @@ use crate::footprint::shape::ShapeError;
 /// Why a call failed. `address` is that of the server or router, as the client connected to it.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum ClientError {
-    /// The text is not an address, or a certificate is invalid.
+    /// The text is not an address.
     #[error(
         "server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051, \
          and https://HOST:PORT with certificates"
@@ -17,6 +17,14 @@ pub enum ClientError {
         /// The text as given.
         address: String,
         /// What is wrong with it.
+        reason: String,
+    },
+    /// A certificate or a key is invalid, or they do not belong together.
+    #[error("certificates for {address}: {reason}")]
+    Certificate {
+        /// The address.
+        address: String,
+        /// What is wrong with them.
         reason: String,
     },
     /// No server answers at the address, or the connection failed.

@@ -325,6 +325,17 @@ impl LatestSlot {
         });
     }
 
+    /// True if a map was stored.
+    #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "over gRPC the server refuses a wrong name"))]
+    pub(crate) fn has_map(&self) -> bool {
+        self.slot.borrow().newest.is_some()
+    }
+
+    /// True if the reader has dropped the stream: then nothing is said of its end.
+    pub(crate) fn is_dropped(&self) -> bool {
+        self.slot.is_closed()
+    }
+
     /// Counts a message that is not stored.
     #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "over gRPC the server itself is known"))]
     pub(crate) fn pass_over(&self, reason: Reason) {

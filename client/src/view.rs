@@ -44,7 +44,8 @@ impl fmt::Display for Staleness {
             Self::NoNewer => formatter.write_str("no newer map has arrived"),
             Self::OnArrival { age_ns } => write!(
                 formatter,
-                "it was {:.0} ms old when it arrived: maps are delayed, or its stamps are behind the reader's clock",
+                "it was {:.0} ms old when it arrived: maps are delayed, its stamps are behind the reader's clock, \
+                 or a recording is replayed without --as-live",
                 ms(*age_ns)
             ),
             Self::InTheFuture { ahead_ns } => write!(

@@ -34,7 +34,7 @@ mod replay;
 mod status;
 mod subscription;
 
-use query::{LayerKey, QUERY_TIMEOUT, failed};
+use query::{LayerKey, failed};
 use subscription::LayerSubscription;
 
 /// Settings of every session. They override those of a configuration file.
@@ -95,7 +95,8 @@ impl ZenohClient {
     /// between two of them costs a map. The server must have `zenoh.mode = "client"`.
     ///
     /// # Errors
-    /// [`ClientError::Zenoh`] if the text is not an endpoint, or if no router answers within 5 s.
+    /// [`ClientError::Zenoh`] if the text is not an endpoint, [`ClientError::Unreachable`] if no router answers within
+    /// 5 s.
     pub async fn connect(endpoint: &str) -> Result<Self, ClientError> {
         Self::open(endpoint, Config::default()).await
     }
@@ -104,8 +105,7 @@ impl ZenohClient {
     /// `tls/HOST:PORT`, as in `deploy/zenoh/client.json5`.
     ///
     /// # Errors
-    /// [`ClientError::Zenoh`] if the file cannot be read or is not a configuration, the text is not an endpoint, or no
-    /// router answers.
+    /// [`ClientError::Zenoh`] if the file cannot be read or is not a configuration; else as [`ZenohClient::connect`].
     pub async fn connect_with(endpoint: &str, file: &Path) -> Result<Self, ClientError> {
         let config = Config::from_file(file).map_err(failed(format!("configuration {}", file.display())))?;
         Self::open(endpoint, config).await
@@ -139,7 +139,10 @@ impl ZenohClient {
             config.insert_json5(key, value).map_err(failed(format!("{key} = {value}")))?;
         }
         let endpoints = format!("{:?}", endpoint.split(separator).collect::<Vec<_>>());
-        config.insert_json5("connect/endpoints", &endpoints).map_err(failed(format!("endpoint {endpoint:?}")))?;
+        config.insert_json5("connect/endpoints", &endpoints).map_err(|_| ClientError::Zenoh {
+            what: format!("endpoint {endpoint:?}"),
+            reason: "PROTOCOL/HOST:PORT is allowed, such as tcp/localhost:7447".into(),
+        })?;
         let (until, (first_ms, longest_ms)) = (Instant::now() + OPEN_MAX, OPEN_TIMEOUT_MS);
         // The one attempt to open a peer goes on in the background.
         let mut open_timeout_ms = if endpoint.contains('+') { longest_ms } else { first_ms };
@@ -148,7 +151,7 @@ impl ZenohClient {
             config.insert_json5(setting, &open_timeout_ms.to_string()).map_err(failed(setting))?;
             match zenoh::open(config.clone()).await {
                 Ok(session) => return Ok(Self { session, endpoint: endpoint.into(), signed_by: None }),
-                Err(error) if Instant::now() >= until => return Err(failed(format!("connect to {endpoint}"))(error)),
+                Err(error) if Instant::now() >= until => return Err(unconnected(endpoint, error)),
                 Err(_) => tokio::time::sleep(OPEN_RETRY).await,
             }
             open_timeout_ms = longest_ms.min(2 * open_timeout_ms);
@@ -167,18 +170,7 @@ impl ZenohClient {
     /// # Errors
     /// [`ClientError::Zenoh`] if the query fails.
     pub async fn vehicles(&self) -> Result<Vec<String>, ClientError> {
-        let liveliness = self.session.liveliness();
-        let replies = liveliness.get("clearway/*").timeout(QUERY_TIMEOUT);
-        let replies = replies.await.map_err(failed("liveliness clearway/*"))?;
-        let mut names = Vec::new();
-        while let Ok(reply) = replies.recv_async().await {
-            if let Ok(sample) = reply.result() {
-                names.extend(sample.key_expr().as_str().strip_prefix("clearway/").map(str::to_owned));
-            }
-        }
-        names.sort_unstable();
-        names.dedup();
-        Ok(names)
+        query::published(&self.session, "clearway/*", 1).await
     }
 
     /// Newest map of one layer; `None` if no server serves it or there is no map yet.
@@ -203,11 +195,12 @@ impl ZenohClient {
         let subscription = subscription.map_err(failed(format!("subscribe to {key}")))?;
         let replay = replay::subscribe(&self.session, vehicle, slot.clone(), &self.endpoint).await?;
         let status = status::subscribe(&self.session, vehicle, slot.clone()).await?;
+        let told = slot.clone();
         // A session closes with its last clone and ends its subscriptions, so the stream keeps a clone.
         let Self { session, endpoint: address, .. } = self.clone();
         Ok(MapStream::of_slot(&slot, async move {
-            let _held = (session, replay, status);
-            subscription.closed().await;
+            let _held = (replay, status);
+            tokio::join!(subscription.closed(), status::tell_absence(&session, &layer, &told));
             ClientError::Ended { address }
         }))
     }
@@ -273,6 +266,16 @@ impl ZenohClient {
         });
         Ok(Ingester::new(self.endpoint.clone(), send, receiver))
     }
+}
+
+/// The error of a session that could not be opened. zenoh says the same of a router that is not there and of one that
+/// refuses a certificate.
+fn unconnected(endpoint: &str, error: zenoh::Error) -> ClientError {
+    if !error.to_string().contains("Unable to connect") {
+        return failed(format!("connect to {endpoint}"))(error);
+    }
+    let reason = format!("no zenoh router or server accepts a connection within {} s", OPEN_MAX.as_secs());
+    ClientError::Unreachable { address: endpoint.into(), reason }
 }
 
 /// Key of an observation.

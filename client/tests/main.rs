@@ -7,3 +7,5 @@ mod stream;
 mod view;
 #[cfg(feature = "zenoh")]
 mod zenoh;
+#[cfg(feature = "zenoh")]
+mod zenoh_names;

@@ -4,7 +4,7 @@ use std::pin::Pin;
 use std::sync::Mutex;
 
 use clearway_client::v1::map_service_server::{MapService, MapServiceServer};
-use clearway_client::{Client, ClientError, Subscription, v1};
+use clearway_client::{Client, ClientError, Subscription, Tls, v1};
 use clearway_proto::codec::Limits;
 use clearway_proto::delta::encode_delta;
 use clearway_proto::map::{encode_header, encode_layer};
@@ -182,6 +182,9 @@ async fn an_invalid_address_is_refused_with_what_is_allowed() {
         assert!(matches!(error, ClientError::Address { .. }), "{address}: {error}");
         assert!(error.to_string().contains("HOST:PORT or http://HOST:PORT is allowed"), "{error}");
     }
+    let identity = Some(("no certificate".into(), "no key".into()));
+    let error = Client::connect_tls("localhost:1", &Tls { identity, ..Tls::default() }).await.unwrap_err();
+    assert!(matches!(&error, ClientError::Certificate { .. }) && !error.to_string().contains("HOST:PORT"), "{error}");
     let closed = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
     let error = Client::connect(&closed.to_string()).await.unwrap_err();
     assert!(error.to_string().starts_with("no clearway server answers at http://127.0.0.1:"), "{error}");

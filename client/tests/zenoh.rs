@@ -16,7 +16,7 @@ use crate::common::{CAPTURE_END_NS, map};
 
 const KEY: &str = "clearway/alpha/map/drivability";
 
-async fn server() -> (Session, String) {
+pub async fn server() -> (Session, String) {
     let mut config = zenoh::Config::default();
     config.insert_json5("listen/endpoints", "[\"tcp/127.0.0.1:0\"]").unwrap();
     config.insert_json5("scouting/multicast/enabled", "false").unwrap();
@@ -28,7 +28,7 @@ async fn server() -> (Session, String) {
 }
 
 /// Declares a publisher as the server does.
-async fn publisher(server: &Session) -> AdvancedPublisher<'static> {
+pub async fn publisher(server: &Session) -> AdvancedPublisher<'static> {
     let publisher = server.declare_publisher(KEY).cache(CacheConfig::default().max_samples(1));
     let misses = publisher.sample_miss_detection(MissDetectionConfig::default());
     misses.publisher_detection().await.unwrap()

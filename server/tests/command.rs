@@ -28,7 +28,8 @@ fn help_lists_the_subcommands_in_order_and_the_exit_codes() {
 fn every_subcommand_has_help() {
     let help = text(&clearway(&["--help"]).stdout);
     let names = help.lines().filter_map(|line| line.strip_prefix("  ")?.split_once(' ').map(|(name, _)| name));
-    let names: Vec<&str> = names.filter(|name| !name.is_empty() && !name.starts_with('-')).collect();
+    let names: Vec<&str> =
+        names.filter(|name| !matches!(name.chars().next(), None | Some('-')) && *name != "help").collect();
     assert_eq!(names.len(), 24, "{names:?}");
     for name in names {
         let output = clearway(&[name, "--help"]);
@@ -300,4 +301,35 @@ fn simulate_refuses_to_overwrite_a_file() {
     assert!(output.status.code() == Some(2) && text(&output.stderr).contains("exists"), "{}", text(&output.stderr));
     assert_eq!(std::fs::read(&file).unwrap(), b"keep");
     assert_eq!(clearway(&["simulate", "flat"]).status.code(), Some(3), "--out or --to is needed");
+}
+
+#[test]
+fn an_unknown_word_or_option_is_refused_with_what_the_subcommand_has() {
+    for (arguments, tip) in [
+        (
+            &["serve", "a.toml"][..],
+            "tip: a value needs its option: --config <FILE>, --set <KEY=VALUE>, --vehicle <NAME>",
+        ),
+        (&["watch", "car"], "--vehicle <NAME>"),
+        (&["status", "--vehicle", "car"], "tip: 'VEHICLE' is a word without '--vehicle'"),
+    ] {
+        let output = clearway(arguments);
+        let error = text(&output.stderr);
+        assert!(output.status.code() == Some(3) && error.contains(tip) && !error.contains("'-- "), "{error}");
+    }
+    assert!(text(&clearway(&["help", "watch"]).stdout).contains("Usage: clearway watch"));
+    assert!(text(&clearway(&["transport", "--help"]).stdout).contains("[alias: speed]"));
+}
+
+#[test]
+fn every_port_in_use_is_named_at_once_with_what_to_do() {
+    let [first, second] = [(); 2].map(|()| std::net::TcpListener::bind("127.0.0.1:0").unwrap());
+    let [first_at, second_at] = [&first, &second].map(|socket| socket.local_addr().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("clearway.toml"), clearway(&["check", "--default"]).stdout).unwrap();
+    let set = [format!("--set=grpc.listen={first_at}"), format!("--set=page.listen={second_at}")];
+    let output = clearway_in(folder.path(), &["serve", &set[0], &set[1]]);
+    let error = text(&output.stderr);
+    let named = [format!("grpc.listen {first_at}: "), format!("page.listen {second_at}: ")];
+    assert!(named.iter().all(|part| error.contains(part)) && error.contains("perhaps another clearway"), "{error}");
 }

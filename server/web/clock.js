@@ -77,8 +77,8 @@ function staleness(on_arrival_ms, age_ms, validity_ms) {
     return `it was captured ${(-age_ms).toFixed()} ms in the future: its stamps are ahead of the reader's clock`;
   }
   if (on_arrival_ms > validity_ms) {
-    const causes = "maps are delayed, or its stamps are behind the reader's clock";
-    return `it was ${on_arrival_ms.toFixed()} ms old when it arrived: ${causes}`;
+    const causes = "maps are delayed, its stamps are behind the reader's clock, or a recording is replayed without";
+    return `it was ${on_arrival_ms.toFixed()} ms old when it arrived: ${causes} --as-live`;
   }
   return age_ms > validity_ms ? "no newer map has arrived" : null;
 }

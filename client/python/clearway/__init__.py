@@ -59,7 +59,8 @@ def watch(
     as old as it was when it was made, plus the time since it came: for a replay that keeps the recorded stamps. With
     `reconnect`, the stream waits for a server that is not there, at the start and later, with pauses of 0.1 to 5 s;
     `MapStream.reasons` and the log "clearway" say so. Errors of the server are raised by the first `next`; for an
-    unknown vehicle or layer the message lists the known ones. For zenoh, which always reconnects: with `signed_by`, the
+    unknown vehicle or layer the message lists the known ones. Over zenoh, which always reconnects later, `reconnect`
+    waits for a router at the start, and `MapStream.reasons` names what no server publishes; with `signed_by`, the
     PEM file of a server's public key, only maps that this server has signed are believed; `MapStream.passed_over`
     counts the others.
     """
@@ -69,7 +70,7 @@ def watch(
         if max_rate_hz is not None or region is not None or deltas or replay_clock:
             text = "max_rate_hz, region, deltas and replay_clock are for gRPC, HOST:PORT"
             raise ClearwayError("selection", f"{address}: {text}")
-        return over_zenoh.watch(endpoint, vehicle, layers, tls, signed_by)
+        return over_zenoh.watch(endpoint, vehicle, layers, tls, signed_by, reconnect)
     selection = service_pb2.Selection(vehicle=vehicle, layers=layers, max_in_flight=max_in_flight, deltas=deltas)
     if max_rate_hz is not None:
         selection.max_rate_hz = max_rate_hz

@@ -6,6 +6,7 @@ In: an encoded `clearway.v1.Map` from any transport.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +23,8 @@ from .v1 import map_pb2
 
 #: Longest time after its capture for which a map is believed to be valid (the Rust client's view.rs).
 _VALID_NS_MAX = 60_000_000_000
+#: Most maps of which some layers have arrived. Ours: layers of one map arrive together.
+_MAPS_BEGUN_MAX = 16
 
 
 class Map:
@@ -80,6 +83,16 @@ class Map:
         """Number of the map: 0, 1, 2 and so on, without gaps, within one run of the server (`header.boot_id`)."""
         return self.header.sequence
 
+    @property
+    def pose(self) -> tuple[float, float, float] | None:
+        """Where the vehicle is in its locally fixed frame: x, y (m) and the heading (rad, counterclockwise from x), from
+        `header.map_from_ego`. `None` if it is not known."""
+        if not self.header.HasField("map_from_ego"):
+            return None
+        of = self.header.map_from_ego
+        heading = math.atan2(2 * (of.qw * of.qz + of.qx * of.qy), 1 - 2 * (of.qy**2 + of.qz**2))
+        return of.x, of.y, heading
+
     @cached_property
     def layers(self) -> dict[str, Layer]:
         """Layers by name, in the order of the server's configuration. They are decoded at the first access."""
@@ -134,7 +147,8 @@ class Map:
             return f"it was captured {ahead_ns * 1e-6:.0f} ms in the future: its stamps are ahead of the reader's clock"
         came_ns = 0 if self._arrival is None else self._arrival.age_ns
         if came_ns > valid_ns:
-            causes = "maps are delayed, or its stamps are behind the reader's clock"
+            causes = "maps are delayed, its stamps are behind the reader's clock"
+            causes += ", or a recording is replayed without --as-live"
             return f"it was {came_ns * 1e-6:.0f} ms old when it arrived: {causes}"
         return "no newer map has arrived" if self.age_ns(at_ns) > valid_ns else None
 
@@ -213,3 +227,35 @@ def _check_header(message: map_pb2.Map) -> None:
         norm = math.hypot(pose.qx, pose.qy, pose.qz, pose.qw)
         if not all(map(math.isfinite, (pose.x, pose.y, pose.z))) or not abs(norm - 1) <= 1e-3:
             raise DecodeError("header", f"map_from_ego {pose}: finite metres and a unit quaternion are needed")
+
+
+class LayerCollector:
+    """Encoded maps of one layer each -> whole maps."""
+
+    def __init__(self, layers: Sequence[str]) -> None:
+        self._layers = list(dict.fromkeys(layers))
+        #: Parts of the maps that began last, by run and sequence: a false part does not replace those of a true map.
+        self._parts: dict[tuple[int, int], dict[str, bytes]] = {}
+
+    def add(self, part: bytes, message: map_pb2.Map) -> list[bytes]:
+        """Adds one layer. Returns the whole map when it is complete, else nothing."""
+        id_ = (message.header.boot_id, message.header.sequence)
+        parts = self._parts.pop(id_, {})
+        parts.update({layer.name: part for layer in message.layers})
+        if all(layer in parts for layer in self._layers):
+            return [self._whole(parts)]
+        self._parts[id_] = parts
+        while len(self._parts) > _MAPS_BEGUN_MAX:
+            del self._parts[next(iter(self._parts))]
+        return []
+
+    def _whole(self, parts: dict[str, bytes]) -> bytes:
+        first, *rest = (parts[layer] for layer in self._layers)
+        # Protobuf messages concatenate: header and first layer, then the other layers.
+        return first + b"".join(_without_header(part) for part in rest)
+
+
+def _without_header(part: bytes) -> bytes:
+    message = map_pb2.Map.FromString(part)
+    message.ClearField("header")
+    return message.SerializeToString()

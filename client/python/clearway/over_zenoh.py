@@ -19,7 +19,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from .errors import ClearwayError, forked
-from .map import Map
+from .map import LayerCollector, Map
 from .signature import PublicKey
 from .stream import LatestSlot, MapStream
 from .tls import Tls
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import zenoh
     import zenoh.ext
 
-_TIMEOUT_S = 5.0
+_TIMEOUT_S, _EXAMPLE = 5.0, "zenoh:tcp/localhost:7447"
 #: Time until the next attempt to open a session; longest time for an endpoint to answer, in ms, in the first attempt
 #: and in the attempts after it.
 _OPEN_RETRY_S, _OPEN_TIMEOUT_MS = 0.2, (500, 2000)
@@ -38,8 +38,6 @@ _OPEN_RETRY_S, _OPEN_TIMEOUT_MS = 0.2, (500, 2000)
 _MISSES_KEPT = 1024
 #: Samples kept per key between zenoh and the thread that reads them: that many false ones hide no true one.
 _SAMPLES_KEPT = 64
-#: Most maps of which some layers have arrived. Ours: layers of one map arrive together.
-_MAPS_BEGUN_MAX = 16
 #: Longest wait for the last map of a replay that has ended.
 _LAST_MAP_S = 1.0
 #: Settings of every session; client/src/zenoh.rs has the reasons.
@@ -59,8 +57,9 @@ _process: int | None = None
 _CERTIFICATES = {"ca": "root_ca_certificate", "cert": "connect_certificate", "key": "connect_private_key"}
 
 
-def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
-    """A session at the first of several endpoints `A,B` that answers, or at all of `A+B`."""
+def _session(endpoint: str, tls: Tls | None, waiting: LatestSlot | None = None) -> zenoh.Session:
+    """A session at the first of several endpoints `A,B` that answers, or at all of `A+B`. With the slot of a stream it
+    waits for a router that is not there, until the stream is closed."""
     try:
         import zenoh
     except ImportError:
@@ -68,6 +67,8 @@ def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
     _check_not_forked()
     encrypted: dict[str, Any] = {"so_rcvbuf": 262144}
     endpoints = endpoint.split("+" if "+" in endpoint else ",")
+    if not all("/" in one for one in endpoints):
+        raise ClearwayError("address", f"zenoh:{endpoint}: zenoh:PROTOCOL/HOST:PORT is allowed, such as {_EXAMPLE}")
     if tls is not None:
         if not all(one.startswith("tls/") for one in endpoints):
             raise ClearwayError("certificate", f"zenoh:{endpoint}: certificates are for zenoh:tls/HOST:PORT")
@@ -86,8 +87,14 @@ def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
         try:
             return zenoh.open(config)
         except Exception as error:
-            if time.monotonic() >= until:
-                raise ClearwayError("zenoh", f"connect to {endpoint}: {error}") from None
+            # The text of zenoh names a line of its sources.
+            is_away, reason = "Unable to connect" in str(error), str(error).split(" at /")[0]
+            if is_away:
+                reason = "no zenoh router or server accepts a connection"
+            if is_away and waiting is not None and not waiting.closed:
+                waiting.set_reasons([f"{endpoint}: {reason}"])
+            elif waiting is not None or time.monotonic() >= until:
+                raise ClearwayError("zenoh", f"{endpoint}: {reason}") from None
         time.sleep(_OPEN_RETRY_S)
         open_timeout_ms = min(2 * open_timeout_ms, longest_ms)
 
@@ -102,8 +109,33 @@ def _check_not_forked() -> None:
 
 def vehicles(endpoint: str, tls: Tls | None) -> list[str]:
     with _session(endpoint, tls) as session:
-        replies = session.liveliness().get("clearway/*", timeout=_TIMEOUT_S)
-        return sorted({str(reply.ok.key_expr).removeprefix("clearway/") for reply in replies if reply.ok})
+        return _published(session, "clearway/*", 1)
+
+
+def _published(session: zenoh.Session, keys: str, place: int) -> list[str]:
+    """Sorted names at a place of the keys that are published now and fit `keys`."""
+    replies = session.liveliness().get(keys, timeout=_TIMEOUT_S)
+    return sorted({str(reply.ok.key_expr).split("/")[place] for reply in replies if reply.ok})
+
+
+def _tell_absence(session: zenoh.Session, vehicle: str, layers: Sequence[str], slot: LatestSlot) -> None:
+    """Tells the slot once a second, until it has a map, which vehicle or layer no server publishes."""
+    import zenoh
+
+    while slot.newest() is None and not slot.wait_closed(1.0):
+        try:
+            what, names = f"the vehicle {vehicle!r}", _published(session, "clearway/*", 1)
+            absent = vehicle not in names
+            if not absent:
+                names = _published(session, f"clearway/{vehicle}/map/*/@adv/pub/**", 3)
+                what = f"of {vehicle} the layers {', '.join(layer for layer in layers if layer not in names)}"
+                absent = not set(layers) <= set(names)
+        except zenoh.ZError:
+            # The session is being closed.
+            return
+        if slot.newest() is None:
+            text = f"no server publishes {what} now; published: {', '.join(names) or 'none'}"
+            slot.set_reasons([text] if absent else [])
 
 
 def put(session: zenoh.Session, key: str, payload: bytes) -> None:
@@ -158,7 +190,7 @@ class _LayerKey:
 def get(
     endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None, signed_by: str | PathLike[str] | None
 ) -> Map:
-    collector, server = _LayerCollector(layers), None if signed_by is None else PublicKey(signed_by)
+    collector, server = LayerCollector(layers), None if signed_by is None else PublicKey(signed_by)
     keys, whole, unfit = [_LayerKey(vehicle, layer, server) for layer in layers], [], 0
     with _session(endpoint, tls) as session:
         # A new map can come between two queries; the second round then finds one sequence.
@@ -180,28 +212,57 @@ def get(
 
 
 def watch(
-    endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None, signed_by: str | PathLike[str] | None
+    endpoint: str,
+    vehicle: str,
+    layers: Sequence[str],
+    tls: Tls | None,
+    signed_by: str | PathLike[str] | None,
+    reconnect: bool,
 ) -> MapStream:
-    server = None if signed_by is None else PublicKey(signed_by)
-    session = _session(endpoint, tls)
-    slot = LatestSlot()
+    server, slot = None if signed_by is None else PublicKey(signed_by), LatestSlot()
+    sessions: list[zenoh.Session] = []
     threads: list[threading.Thread] = []
 
+    def open_() -> None:
+        sessions.append(_session(endpoint, tls, slot if reconnect else None))
+        writer = _StreamWriter(slot, layers)
+        try:
+            for layer in writer.layers:
+                threads.extend(_LayerSubscription(sessions[0], _LayerKey(vehicle, layer, server), writer).threads)
+            threads.append(_ReplaySubscription(sessions[0], f"clearway/{vehicle}/replay", slot).thread)
+            told = (sessions[0], vehicle, writer.layers, slot)
+            threads.append(threading.Thread(target=_tell_absence, args=told, name="clearway watch names", daemon=True))
+            threads[-1].start()
+        except Exception as error:
+            raise ClearwayError("zenoh", f"subscribe to the layers of {vehicle!r}: {error}") from None
+
+    def open_when_there() -> None:
+        try:
+            open_()
+        except ClearwayError as error:
+            slot.end(error)
+
+    opening = threading.Thread(target=open_when_there, name="clearway watch", daemon=True)
+
     def close() -> None:
-        session.close()  # type: ignore[no-untyped-call]
-        # The garbage collector may call this from one of them.
+        # The garbage collector may call this from one of the threads.
+        for thread in [opening] if reconnect else []:
+            if thread is not threading.current_thread():
+                thread.join(_TIMEOUT_S)
+        for session in sessions:
+            session.close()  # type: ignore[no-untyped-call]
         for thread in threads:
             if thread is not threading.current_thread():
                 thread.join(_TIMEOUT_S)
 
-    try:
-        writer = _StreamWriter(slot, layers)
-        for layer in writer.layers:
-            threads += _LayerSubscription(session, _LayerKey(vehicle, layer, server), writer).threads
-        threads.append(_ReplaySubscription(session, f"clearway/{vehicle}/replay", slot).thread)
-    except Exception as error:
-        close()
-        raise ClearwayError("zenoh", f"subscribe to the layers of {vehicle!r}: {error}") from None
+    if reconnect:
+        opening.start()
+    else:
+        try:
+            open_()
+        except ClearwayError:
+            close()
+            raise
     # The stream closes before Python shuts down: a thread that returned from zenoh later would abort the process.
     return MapStream(slot, close)
 
@@ -312,7 +373,7 @@ class _StreamWriter:
     """Parts of maps from one thread per layer -> a stream."""
 
     def __init__(self, slot: LatestSlot, layers: Sequence[str]) -> None:
-        self._slot, self._collector, self._lock = slot, _LayerCollector(layers), threading.Lock()
+        self._slot, self._collector, self._lock = slot, LayerCollector(layers), threading.Lock()
         self.layers = list(dict.fromkeys(layers))
         #: Samples missed of each layer since the last complete map.
         self._missed = dict.fromkeys(self.layers, 0)
@@ -335,35 +396,3 @@ class _StreamWriter:
                 if self._slot.store(Map(whole), None, lost=max(self._missed.values())):
                     self._missed = dict.fromkeys(self.layers, 0)
         return True
-
-
-class _LayerCollector:
-    """Collects the layers of maps."""
-
-    def __init__(self, layers: Sequence[str]) -> None:
-        self._layers = list(dict.fromkeys(layers))
-        #: Parts of the maps that began last, by run and sequence: a false part does not replace those of a true map.
-        self._parts: dict[tuple[int, int], dict[str, bytes]] = {}
-
-    def add(self, part: bytes, message: map_pb2.Map) -> list[bytes]:
-        """Adds one layer. Returns the whole map when it is complete, else nothing."""
-        id_ = (message.header.boot_id, message.header.sequence)
-        parts = self._parts.pop(id_, {})
-        parts.update({layer.name: part for layer in message.layers})
-        if all(layer in parts for layer in self._layers):
-            return [self._whole(parts)]
-        self._parts[id_] = parts
-        while len(self._parts) > _MAPS_BEGUN_MAX:
-            del self._parts[next(iter(self._parts))]
-        return []
-
-    def _whole(self, parts: dict[str, bytes]) -> bytes:
-        first, *rest = (parts[layer] for layer in self._layers)
-        # Protobuf messages concatenate: header and first layer, then the other layers.
-        return first + b"".join(_without_header(part) for part in rest)
-
-
-def _without_header(part: bytes) -> bytes:
-    message = map_pb2.Map.FromString(part)
-    message.ClearField("header")
-    return message.SerializeToString()

@@ -7,13 +7,14 @@ map. A waiting reader is notified when its map becomes stale, also if no further
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, cast, overload
 
 from .errors import ClearwayError, ReplayEnded, forked
 from .freshness import POLL_INTERVAL_S, Clock
@@ -86,16 +87,21 @@ class MapStream:
         Raises the reason if the stream has ended; stops when closed, and after the last map of a replay. Iterate again
         for the maps of a replay that is set back: it waits 2 s for them, and then stops again."""
         try:
-            return self._slot.next(report_stale=False)
+            return cast(Map, self._slot.next(report_stale=False))
         except (ReplayEnded, _Closed):
             raise StopIteration from None
 
-    def next_or_stale(self) -> Map:
+    @overload
+    def next_or_stale(self, timeout: None = None) -> Map: ...
+    @overload
+    def next_or_stale(self, timeout: float) -> Map | None: ...
+    def next_or_stale(self, timeout: float | None = None) -> Map | None:
         """Waits for a map newer than the last one returned, or until that one is stale. A stale map is returned again,
-        once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. Raises the reason if the
-        stream has ended: `ReplayEnded` at the end of a replay, as an iteration stops there, `ClearwayError` of reason
-        "closed" when closed."""
-        return self._slot.next(report_stale=True)
+        once, at most 20 ms late, also if no further map arrives; `m.stale` is then true. With `timeout`, in seconds, a
+        wait that takes longer returns the newest map again, stale or not, and `None` before the first. Raises the
+        reason if the stream has ended: `ReplayEnded` at the end of a replay, as an iteration stops there,
+        `ClearwayError` of reason "closed" when closed."""
+        return self._slot.next(report_stale=True, timeout=timeout)
 
     def __aiter__(self) -> MapStream:
         return self
@@ -108,7 +114,7 @@ class MapStream:
             raise StopAsyncIteration from None
 
     async def anext_or_stale(self) -> Map:
-        """As `next_or_stale`, without blocking the event loop."""
+        """As `next_or_stale` without a timeout, without blocking the event loop: `asyncio.wait_for` has one."""
         return await self._slot.next_async(report_stale=True)
 
     def newest(self) -> Map | None:
@@ -140,8 +146,8 @@ class MapStream:
     @property
     def reasons(self) -> list[str]:
         """Why no map comes, worst first: the reasons of the vehicle's state on the server, or why there is no
-        connection (`reconnect` of `clearway.watch`). Empty while maps come, in the first second without one, and over
-        zenoh."""
+        connection (`reconnect` of `clearway.watch`). Empty while maps come and in the first second without one. Over
+        zenoh they name the router that does not answer, or the vehicle or layer that no server publishes."""
         return self._slot.reasons()
 
 
@@ -198,19 +204,27 @@ class LatestSlot:
         """True if the stream was closed."""
         return self._closed
 
+    def wait_closed(self, timeout_s: float) -> bool:
+        """Waits until the stream is closed, no longer than `timeout_s`; returns whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._closed, timeout_s)
+
     def close(self) -> None:
         """Ends every wait for a map."""
         with self._changed:
             self._closed = True
             self._notify()
 
-    def next(self, *, report_stale: bool) -> Map:
+    def next(self, *, report_stale: bool, timeout: float | None = None) -> Map | None:
         """Waits as `MapStream.next_or_stale` does, or as `MapStream.__next__`. For the reader."""
         self._check_not_forked()
         with self._changed:
-            until = self._ask()
+            until, end = self._ask(), time.monotonic() + (math.inf if timeout is None else timeout)
             while (found := self._found(until, report_stale)) is None:
-                self._changed.wait(self._pause_s(report_stale))
+                left = end - time.monotonic()
+                if left <= 0:
+                    return None if self._newest is None else self._newest.copy_with()
+                self._changed.wait(min(self._pause_s(report_stale), left))
             return found
 
     async def next_async(self, *, report_stale: bool) -> Map:

@@ -56,6 +56,17 @@ class TestBed:
         assert self.is_silent()
 
 
+def test_a_wait_with_a_timeout_returns_the_newest_map_again():
+    bed = TestBed()
+    assert bed.stream.next_or_stale(timeout=0) is None
+    bed.store_aged(1, 7, 40 * MS)
+    assert bed.next()[:2] == (False, 7)
+    assert (again := bed.stream.next_or_stale(timeout=0)).sequence == 7 and not again.stale
+    bed.check_becomes_stale(7)
+    for _ in range(2):
+        assert (again := bed.stream.next_or_stale(timeout=0.01)).sequence == 7 and again.stale
+
+
 def test_a_map_is_reported_as_stale_after_the_link_is_cut():
     bed = TestBed()
     bed.store_aged(7, 0, 40 * MS)

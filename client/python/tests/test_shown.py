@@ -56,6 +56,7 @@ def test_an_occupancy_grid_has_every_obstacle_in_its_place_and_no_unknown_cell_i
     turn = heading or 0.0
     at = np.array([0.0, 0.0]) if heading is None else np.array([123.4, -7.7])
     x, y = of.grid.centres().reshape(-1, 2).T
+    assert m.pose is None if heading is None else np.allclose(m.pose, (123.4, -7.7, heading))
     placed = np.stack([x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn)], axis=-1) + at
     ix, iy = np.floor((placed - grid.origin[:2]) / grid.resolution).astype(int).T
     here = grid.data[iy, ix]

@@ -31,7 +31,7 @@ pub(super) async fn follow<F: Future<Output = Result<Watch, ClientError>>>(
     let (mut watch, mut base) = (opened, None);
     loop {
         let mut ended = receive_maps(&slot, &address, watch, &mut base).await;
-        let Some(open) = &open_again else { return ended };
+        let Some(open) = open_again.as_ref().filter(|_| !slot.is_dropped()) else { return ended };
         tracing::warn!(reason = %ended, "the stream of maps has ended and is opened again");
         let mut pause = PAUSE.0;
         watch = loop {

@@ -111,9 +111,9 @@ impl Client {
     /// Connects to `HOST:PORT` or `https://HOST:PORT` with certificates.
     ///
     /// # Errors
-    /// [`ClientError::Address`] if the text is not an address or a certificate is invalid, [`ClientError::Unreachable`]
-    /// if no server answers or one side rejects the certificate of the other. The server may reject a client's
-    /// certificate only at the first call.
+    /// [`ClientError::Address`] if the text is not an address, [`ClientError::Certificate`] if a certificate is
+    /// invalid, [`ClientError::Unreachable`] if no server answers or one side rejects the certificate of the other. The
+    /// server may reject a client's certificate only at the first call.
     pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
         Self::open(address, Some(tls)).await
     }
@@ -136,7 +136,9 @@ impl Client {
         let url = url(address, tls.is_some())?;
         let mut endpoint = Endpoint::from_shared(url.clone()).map_err(|error| wrong(&innermost(&error)))?;
         if let Some(tls) = tls {
-            endpoint = endpoint.tls_config(tls.to_tonic()).map_err(|error| wrong(&innermost(&error)))?;
+            endpoint = endpoint
+                .tls_config(tls.to_tonic())
+                .map_err(|error| ClientError::Certificate { address: address.into(), reason: innermost(&error) })?;
         }
         let endpoint = endpoint
             .connect_timeout(CONNECT_TIMEOUT)

@@ -16,11 +16,17 @@ pub(super) fn refused(address: &str, status: &Status) -> ClientError {
     }
 }
 
-/// Message of the innermost cause: the outer one is only "transport error".
+/// Message of the innermost cause: the outer one is only "transport error". The first bytes of an encrypted answer are
+/// no frame of HTTP/2.
 pub(super) fn innermost(error: &dyn std::error::Error) -> String {
     let mut error = error;
     while let Some(source) = error.source() {
         error = source;
     }
-    error.to_string()
+    match error.to_string() {
+        text if text.contains("frame with invalid size") => {
+            format!("what answers there encrypts, or is no gRPC server ({text})")
+        }
+        text => text,
+    }
 }

@@ -1,5 +1,6 @@
 //! Samples of a key -> maps that belong there; key -> the newest map; and the errors of zenoh.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use zenoh::Session;
@@ -63,6 +64,24 @@ impl LayerKey {
         if is_ours { Ok(map) } else { Err((|passed| &mut passed.misplaced, None)) }
     }
 
+    /// Why no map can come on the key now: no server publishes the vehicle, or the layer; `None` if one does.
+    ///
+    /// # Errors
+    /// [`ClientError::Zenoh`] if the query fails.
+    pub async fn absence(&self, session: &Session) -> Result<Option<String>, ClientError> {
+        let (vehicle, layer) = (&self.vehicle, &self.layer);
+        let absent = |what: String, names: Vec<String>| {
+            let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+            Some(format!("no server publishes {what} now; published: {names}"))
+        };
+        let vehicles = published(session, "clearway/*", 1).await?;
+        if !vehicles.contains(vehicle) {
+            return Ok(absent(format!("the vehicle {vehicle:?}"), vehicles));
+        }
+        let layers = published(session, &format!("clearway/{vehicle}/map/*/@adv/pub/**"), 3).await?;
+        Ok(if layers.contains(layer) { None } else { absent(format!("the layer {layer:?} of {vehicle}"), layers) })
+    }
+
     /// The newest map among the replies to a query; `None` if there is none.
     ///
     /// # Errors
@@ -89,6 +108,22 @@ impl LayerKey {
             (newest, _) => Ok(newest),
         }
     }
+}
+
+/// Sorted names at a place of the keys that are published now and fit `keys`.
+///
+/// # Errors
+/// [`ClientError::Zenoh`] if the query fails.
+pub(super) async fn published(session: &Session, keys: &str, place: usize) -> Result<Vec<String>, ClientError> {
+    let replies = session.liveliness().get(keys).timeout(QUERY_TIMEOUT);
+    let replies = replies.await.map_err(failed(format!("liveliness {keys}")))?;
+    let mut names = BTreeSet::new();
+    while let Ok(reply) = replies.recv_async().await {
+        if let Ok(sample) = reply.result() {
+            names.extend(sample.key_expr().as_str().split('/').nth(place).map(str::to_owned));
+        }
+    }
+    Ok(names.into_iter().collect())
 }
 
 fn undecodable(passed: &mut crate::stream::PassedOver) -> &mut u64 {

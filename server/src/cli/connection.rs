@@ -97,6 +97,17 @@ fn advice(error: &str) -> Option<&'static str> {
              (port 50051 by default), not the one of the page ([page] listen, port 8080 by default)",
         );
     }
+    if error.contains("what answers there encrypts") {
+        return Some(
+            "if the server encrypts, CLEARWAY_CA names the PEM file of the CA certificate that signed its own",
+        );
+    }
+    if error.contains("UnknownIssuer") {
+        return Some("the CA certificate of CLEARWAY_CA has not signed the server's certificate");
+    }
+    if error.contains("KeyMismatch") {
+        return Some("CLEARWAY_KEY is not the private key of the certificate of CLEARWAY_CERT");
+    }
     if error.contains("CertificateRequired") {
         return Some("the server requires a certificate: CLEARWAY_CERT and CLEARWAY_KEY name it and its key");
     }
@@ -139,6 +150,10 @@ mod tests {
         assert!(advice(error).unwrap().contains("does not accept the certificate"));
         let error = "no clearway server answers at https://localhost:1: connection closed";
         assert!(advice(error).unwrap().contains("does not accept this one"));
+        let error = "no clearway server answers at https://localhost:1: invalid peer certificate: UnknownIssuer";
+        assert!(advice(error).unwrap().contains("CA certificate of CLEARWAY_CA"));
+        let error = "certificates for localhost:1: keys may not be consistent: KeyMismatch";
+        assert!(advice(error).unwrap().contains("CLEARWAY_KEY is not the private key"));
         let error = "no clearway server answers at http://localhost:1: stream closed because of a broken pipe";
         assert!(advice(error).unwrap().contains("the server has stopped"));
     }

@@ -1,7 +1,7 @@
 //! `clearway demo`: a simulated vehicle -> a server of its own, over real UDP.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -61,6 +61,7 @@ async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
     let DemoArguments { seconds: duration, record, sensors, vehicles, any_port } = arguments;
     let pictures = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let picture = record.as_ref().map_or_else(|| pictures.join("demo.png"), |record| record.with_extension("png"));
+    let began = SystemTime::now();
     // Without a file, the recording is a black box in a folder of its own.
     let folder = std::env::temp_dir().join(format!("clearway-demo-{}", std::process::id()));
     let black_box = record.is_none();
@@ -83,17 +84,18 @@ async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
         let _ = std::fs::remove_dir(&folder);
     }
     let summary = driven?;
-    print_line(&left_behind(&file, &picture))?;
+    print_line(&left_behind(&file, &picture, began))?;
     print_line(&summary.text())?;
     Ok(())
 }
 
 /// What the demo leaves on the disk.
-fn left_behind(record: &Path, picture: &Path) -> String {
+fn left_behind(record: &Path, picture: &Path, began: SystemTime) -> String {
     let size = |path: &Path| path.metadata().map_or(0.0, |metadata| metadata.len() as f64 / 1e6);
+    let is_new = |picture: &PathBuf| picture.metadata().and_then(|of| of.modified()).is_ok_and(|at| at >= began);
     let saved = Some(record.with_file_name("saved")).filter(|folder| folder.is_dir());
     let saved = saved.map(|folder| format!("saves in {}", folder.display()));
-    let picture = Some(picture.to_owned()).filter(|picture| picture.exists());
+    let picture = Some(picture.to_owned()).filter(is_new);
     let parts = parts_of(record);
     let file = |file: &PathBuf| format!("{} ({:.1} MB)", file.display(), size(file));
     let files: Vec<String> = parts.iter().chain(&picture).map(file).chain(saved).collect();

@@ -48,7 +48,8 @@ mod tool_commands;
 use std::process::ExitCode;
 
 use anyhow::Result;
-use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{Arg, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use shared::exit::{EXIT_CODES, Exit};
 use shared::logs;
@@ -56,7 +57,7 @@ use shared::output::{printable, with_causes};
 
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]
-#[command(name = "clearway", version, after_help = after_help(), disable_help_subcommand = true)]
+#[command(name = "clearway", version, after_help = after_help())]
 struct ClearwayArguments {
     #[command(subcommand)]
     command: ClearwayCommand,
@@ -101,7 +102,7 @@ pub fn main() -> ExitCode {
     let matches = command().try_get_matches();
     let arguments = match matches.and_then(|matches| ClearwayArguments::from_arg_matches(&matches)) {
         Ok(arguments) => arguments,
-        Err(usage) => return print_usage(&usage),
+        Err(usage) => return print_usage(&with_tip(usage, std::env::args())),
     };
     match logs::start().and_then(|()| run(arguments.command)) {
         Ok(exit) => exit.into(),
@@ -113,6 +114,37 @@ pub fn main() -> ExitCode {
             }
         },
     }
+}
+
+/// The error of an unknown word or option with a tip: of a word, the options of the subcommand that take a value; of an
+/// option that the subcommand reads as a word, this. The tip of clap would pass an unknown option on as a word.
+fn with_tip(mut usage: clap::Error, words: impl Iterator<Item = String>) -> clap::Error {
+    let Some(ContextValue::String(given)) = usage.get(ContextKind::InvalidArg) else { return usage };
+    if usage.kind() != ErrorKind::UnknownArgument {
+        return usage;
+    }
+    let command = command();
+    let called = words.skip(1).fold(&command, |called, word| called.find_subcommand(word).unwrap_or(called));
+    let value = |argument: &Arg| argument.get_value_names().unwrap_or_default().join(" ");
+    let tip = match given.strip_prefix("--") {
+        Some(name) => called
+            .get_positionals()
+            .find(|argument| value(argument).eq_ignore_ascii_case(name))
+            .map(|argument| format!("'{}' is a word without '{given}'", value(argument))),
+        None if given.starts_with('-') => None,
+        None => {
+            let options = called.get_opts().filter(|option| option.get_action().takes_values());
+            let named = options.filter_map(|option| Some(format!("--{} <{}>", option.get_long()?, value(option))));
+            Some(named.collect::<Vec<_>>().join(", "))
+                .filter(|options| !options.is_empty())
+                .map(|options| format!("a value needs its option: {options}"))
+        }
+    };
+    usage.remove(ContextKind::Suggested);
+    if let Some(tip) = tip {
+        usage.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![tip.into()]));
+    }
+    usage
 }
 
 /// Prints an error of usage, or the help that was asked for.

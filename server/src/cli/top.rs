@@ -63,7 +63,7 @@ async fn show(options: &TopArguments, screen: &Screen) -> Result<()> {
         if shown == 0 {
             check(&client, &vehicles, &options.vehicles).await?;
         }
-        if !screen.show(&table(vehicles, screen.size().1, screen.is_live()))? {
+        if !screen.show(&table(vehicles, screen.size().1, screen.is_coloured()))? {
             break;
         }
         shown += 1;
@@ -187,6 +187,11 @@ impl Screen {
     /// True if stdout is a terminal.
     fn is_live(&self) -> bool {
         self.0.is_term()
+    }
+
+    /// True if stdout is a terminal with colours and `NO_COLOR` is not set.
+    fn is_coloured(&self) -> bool {
+        self.0.features().colors_supported()
     }
 
     /// Number of rows that [`Screen::show`] can show, and number of columns.

@@ -64,6 +64,7 @@ enum TransportRequest {
         all: bool,
     },
     /// Set the speed: 0.1 to 1000 times the recorded one, or max.
+    #[command(visible_alias = "speed")]
     Rate {
         /// A factor, or max.
         rate: ReplaySpeed,

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
+use clap::builder::RangedI64ValueParser;
 use clearway_client::{ClientError, MapStream, Staleness, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
@@ -25,7 +26,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
 /// If no map arrives, or no newer one before the last one becomes stale, a line says STALE and why once a second until
-/// maps arrive again. Over gRPC it waits for a server that is not there, at the start and later, unless --count or
+/// maps arrive again. It waits for a server or router that is not there, at the start and later, unless --count or
 /// --until-stale says when it ends. The exit code is 4 if the last line says STALE, and 2 if the server refuses or ends
 /// the stream, or if a replay ends before a map or the maps of --count have come.
 #[derive(Args)]
@@ -57,7 +58,7 @@ pub struct WatchArguments {
     #[arg(long)]
     json: bool,
     /// End after this many maps; at Ctrl-C if absent. If a replay ends before, the exit code is 2.
-    #[arg(long, value_name = "MAPS")]
+    #[arg(long, value_name = "MAPS", value_parser = RangedI64ValueParser::<u64>::new().range(1..))]
     count: Option<u64>,
     /// End with exit code 4 as soon as the map is stale, or none has come for a second.
     #[arg(long)]
@@ -234,7 +235,14 @@ async fn subscribe_over_zenoh(endpoint: &str, options: &WatchArguments) -> Resul
         [layer] => layer,
         several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
     };
-    let mut client = options.server.connect_over_zenoh(endpoint).await?;
+    let mut connecting = std::pin::pin!(options.server.connect_over_zenoh(endpoint));
+    let mut client = match tokio::time::timeout(STALE_PERIOD, &mut connecting).await {
+        Ok(connected) => connected?,
+        Err(_) => {
+            eprintln!("clearway: {endpoint} does not answer yet");
+            connecting.await?
+        }
+    };
     if let Some(file) = &options.signed_by {
         client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
     }

@@ -175,7 +175,8 @@ public:
         }
         if (arrival_ && arrival_->age_ns > valid_ns) {
             return "it was " + ms(arrival_->age_ns) +
-                   " old when it arrived: maps are delayed, or its stamps are behind the reader's clock";
+                   " old when it arrived: maps are delayed, its stamps are behind the reader's clock,"
+                   " or a recording is replayed without --as-live";
         }
         if (age_ns(at) > valid_ns) return "no newer map has arrived";
         return std::nullopt;

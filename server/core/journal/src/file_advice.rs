@@ -48,6 +48,7 @@ pub fn advised(file: &Path, error: Error) -> Error {
         },
         ErrorKind::PermissionDenied => "permission denied; check its owner and its mode".into(),
         _ if file.is_dir() => "this is a folder; name a file".into(),
+        ErrorKind::InvalidData => "this is no text file (UTF-8); name one, not a recording or a picture".into(),
         ErrorKind::AlreadyExists if file.symlink_metadata().is_ok() => {
             "the file exists and is not overwritten; delete it, or name another file".into()
         }
@@ -79,6 +80,8 @@ mod tests {
         fs::write(at("long"), vec![b'#'; TEXT_BYTES_MAX as usize + 1]).unwrap();
         let long = advice(&at("long"), read_text(&at("long")).map(drop));
         assert_eq!(long, "it has more than 16 MiB; less is allowed");
+        fs::write(at("picture"), b"\x89PNG").unwrap();
+        assert!(advice(&at("picture"), read_text(&at("picture")).map(drop)).starts_with("this is no text file"));
         assert!(advice(Path::new("/dev/zero"), read_text(Path::new("/dev/zero")).map(drop)).contains("a device"));
         let exists = advice(&at("there"), File::create_new(at("there")).map(drop));
         assert_eq!(exists, "the file exists and is not overwritten; delete it, or name another file");

@@ -81,6 +81,12 @@ pub fn why_no_map(mount: &Mount, snapshot: &Snapshot) -> String {
     if ledger.received == 0 {
         return "the files hold no packet, scan or message that is read".to_owned();
     }
+    if ledger.received == ledger.telemetry {
+        return format!(
+            "the files hold {} of telemetry and no packet with points",
+            counted(ledger.telemetry, "datagram")
+        );
+    }
     let refused = ledger.refused.iter().map(|(reason, n)| match snapshot.refusals.get(reason) {
         Some(first) => format!("{n} for {reason}: {first}"),
         None => format!("{n} for {reason}"),
@@ -303,5 +309,18 @@ pub fn describe(mount: &Mount) -> Option<String> {
              0,0,1.9,0,0,0), or with --config FILE"
         )),
         Mount::Given | Mount::Unneeded => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_of_telemetry_alone_are_called_so() {
+        let mut snapshot = Snapshot::default();
+        (snapshot.ledger.received, snapshot.ledger.telemetry) = (1, 1);
+        let why = why_no_map(&Mount::Unneeded, &snapshot);
+        assert_eq!(why, "the files hold 1 datagram of telemetry and no packet with points");
     }
 }

@@ -25,26 +25,31 @@ pub(super) struct Listeners {
     pub security: Security,
     pub handles: Vec<(&'static str, ListenerHandle)>,
     all: AllSlots,
+    refused: Vec<(String, std::io::ErrorKind)>,
 }
 
 impl Listeners {
     /// Listens on all addresses that the configuration enables, at the held sockets where there are some.
     ///
     /// # Errors
-    /// [`StartError::Listen`] with the first address that cannot be listened on.
+    /// [`StartError::Listen`] with every address that cannot be listened on.
     pub async fn bind(config: &Config, security: &Security, held: &mut HeldSockets) -> Result<Self, StartError> {
-        let (security, all) = (security.clone(), AllSlots::default());
+        let (security, all, refused) = (security.clone(), AllSlots::default(), Vec::new());
         let mut listeners =
-            Self { grpc: None, page: None, metrics: None, foxglove: None, security, handles: vec![], all };
+            Self { grpc: None, page: None, metrics: None, foxglove: None, security, handles: vec![], all, refused };
         let (grpc, page, metrics, foxglove) = (&config.grpc, &config.page, &config.metrics, &config.foxglove);
         let web = Protocol::Web(&[]);
         let for_foxglove = Protocol::Web(foxglove::ORIGINS);
-        listeners.grpc = listeners.add("grpc", grpc.enabled, grpc.listen, Protocol::Grpc, config, held).await?;
-        listeners.page = listeners.add("page", page.enabled, page.listen, web, config, held).await?;
-        listeners.metrics = listeners.add("metrics", metrics.enabled, metrics.listen, web, config, held).await?;
+        listeners.grpc = listeners.add("grpc", grpc.enabled, grpc.listen, Protocol::Grpc, config, held).await;
+        listeners.page = listeners.add("page", page.enabled, page.listen, web, config, held).await;
+        listeners.metrics = listeners.add("metrics", metrics.enabled, metrics.listen, web, config, held).await;
         let added = listeners.add("foxglove", foxglove.enabled, foxglove.listen, for_foxglove, config, held);
-        listeners.foxglove = added.await?;
-        Ok(listeners)
+        listeners.foxglove = added.await;
+        if listeners.refused.is_empty() {
+            return Ok(listeners);
+        }
+        let is_in_use = listeners.refused.iter().any(|(_, kind)| *kind == std::io::ErrorKind::AddrInUse);
+        Err(StartError::Listen { refused: listeners.refused.into_iter().map(|(text, _)| text).collect(), is_in_use })
     }
 
     /// The address on which gRPC listens.
@@ -61,19 +66,22 @@ impl Listeners {
         protocol: Protocol,
         config: &Config,
         held: &mut HeldSockets,
-    ) -> Result<Option<Listener>, StartError> {
+    ) -> Option<Listener> {
         if !is_enabled {
-            return Ok(None);
+            return None;
         }
         let socket = match held.take_tcp(at) {
             Some(socket) => socket.set_nonblocking(true).and_then(|()| TcpListener::from_std(socket)),
             None => TcpListener::bind(at).await,
         };
-        let socket = socket.map_err(|source| StartError::Listen { what: name, at, source })?;
+        let refuse = |error: &std::io::Error| {
+            self.refused.push((format!("{name}.listen {at}: {error}"), error.kind()));
+        };
+        let socket = socket.inspect_err(refuse).ok()?;
         let (listener, handle) =
             Listener::new(socket, protocol, limits(name, config), self.security.clone(), &self.all);
         self.handles.push((name, handle));
-        Ok(Some(listener))
+        Some(listener)
     }
 }
 

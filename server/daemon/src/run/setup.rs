@@ -1,7 +1,6 @@
 //! The parameters of a server, and the errors of its start and its end.
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -39,6 +38,10 @@ pub struct Setup {
     pub replay: Option<ReplayHandle>,
 }
 
+/// What to do about a port that another program has.
+const IN_USE: &str = ": another program has the port, perhaps another clearway; `--set grpc.listen=127.0.0.1:50052` names \
+    another one, and `--any-port` of `replay --serve` and `demo` takes free ones";
+
 /// A server did not start.
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
@@ -48,15 +51,13 @@ pub enum StartError {
     /// The recording cannot be created.
     #[error(transparent)]
     Record(#[from] RecordError),
-    /// An address cannot be listened on.
-    #[error("{what}.listen {at}: {source}")]
+    /// Addresses cannot be listened on.
+    #[error("{}{}", .refused.join("; "), if *.is_in_use { IN_USE } else { "" })]
     Listen {
-        /// The configuration's table.
-        what: &'static str,
-        /// The address.
-        at: SocketAddr,
-        /// The system's reason.
-        source: std::io::Error,
+        /// The key of each address, the address, and the system's reason.
+        refused: Vec<String>,
+        /// True if another program listens on one of them.
+        is_in_use: bool,
     },
     /// The certificates are invalid.
     #[error("grpc.tls: {0}; a PEM certificate (chain), its PEM private key and PEM CA certificates are allowed")]

@@ -287,14 +287,14 @@ fn sensor_findings(sensor: &SensorFacts, validity: Duration, add: &mut impl FnMu
     let name = &sensor.name;
     let is_silent = sensor.silent.is_none_or(|silent| silent > SILENT_AFTER);
     if let Some([height_m, pitch_deg, roll_deg]) = sensor.mount {
-        let place = if height_m < 0.0 { "above" } else { "below" };
+        let place = if height_m < 0.0 { "lower" } else { "higher" };
         let tilt = if pitch_deg.abs().max(roll_deg.abs()) < 0.5 {
             String::new()
         } else {
-            format!(", and is tilted by {pitch_deg:+.1} deg in pitch and {roll_deg:+.1} deg in roll")
+            format!(", and the ground is tilted by {pitch_deg:+.1} deg in pitch and {roll_deg:+.1} deg in roll")
         };
         let height = height_m.abs();
-        add(State::Warn, format!("the ground lies {height:.1} m {place} the configured mount of {name}{tilt}"));
+        add(State::Warn, format!("{name} is {height:.1} m {place} over the ground than configured{tilt}"));
     }
     if is_silent {
         return;

@@ -80,9 +80,17 @@ pub enum UploadError {
     },
 }
 
+/// The address where a machine of AWS has its keys.
+const MACHINE_KEYS: &str = "http://169.254.169.254/";
+
 /// The reason of a store in one line: of the document in which S3 states an error, its code and message.
 pub fn reason(error: &object_store::Error) -> String {
     let text = error.to_string();
+    if text.contains(MACHINE_KEYS) {
+        return format!(
+            "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY are not set, and this machine has no keys: {text}"
+        );
+    }
     let Some((before, document)) = text.split_once("<?xml").or_else(|| text.split_once("<Error>")) else { return text };
     let of = |tag: &str| {
         let (_, rest) = document.split_once(&format!("<{tag}>"))?;

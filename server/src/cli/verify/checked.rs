@@ -1,5 +1,6 @@
 //! Files -> the result of each, several at a time.
 
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -8,7 +9,7 @@ use std::time::Instant;
 use anyhow::{Result, bail};
 
 use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::with_causes;
+use crate::cli::shared::output::{counted, with_causes};
 use clearway_daemon::base::sync::locked;
 use clearway_daemon::config::{Calibrations, Config};
 use clearway_daemon::record::{recorded_config, recorded_vehicles, run_config, verify};
@@ -122,7 +123,13 @@ pub fn check_all(files: &[PathBuf], check: &Check) -> Vec<Checked> {
                     let index = next.fetch_add(1, Ordering::Relaxed);
                     let Some(file) = files.get(index) else { break };
                     let result = check_one(file, check);
-                    locked(&results)[index] = Some(result);
+                    let mut results = locked(&results);
+                    results[index] = Some(result);
+                    // A person sees that the command goes on; the results are printed at the end.
+                    if std::io::stderr().is_terminal() {
+                        let checked = results.iter().flatten().count();
+                        eprintln!("clearway: {checked} of {} checked", counted(files.len() as u64, "file"));
+                    }
                 }
             });
         }

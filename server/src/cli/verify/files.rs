@@ -1,6 +1,7 @@
 //! Paths, patterns and stores of the command line -> files, in alphabetical order; a shard of them.
 
 use std::collections::BTreeSet;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -80,11 +81,13 @@ fn in_store(url: &str) -> Result<Vec<PathBuf>> {
     bail!("{url}: this clearway was built without the feature store");
 }
 
-/// The files that match a pattern.
+/// The files that match a pattern; a file with several names (a saved part is a hard link) by its first one alone.
 fn matching(pattern: &str) -> Result<Vec<PathBuf>> {
     let paths = glob::glob(pattern).with_context(|| format!("{pattern}: not a pattern"))?;
     let paths: Vec<PathBuf> = paths.collect::<Result<_, _>>()?;
-    Ok(paths.into_iter().filter(|path| path.is_file()).collect())
+    let mut seen = BTreeSet::new();
+    let mut is_new = |path: &PathBuf| path.metadata().is_ok_and(|of| of.is_file() && seen.insert((of.dev(), of.ino())));
+    Ok(paths.into_iter().filter(&mut is_new).collect())
 }
 
 #[cfg(test)]
@@ -99,6 +102,7 @@ mod tests {
             std::fs::write(folder.path().join(name), "").unwrap();
         }
         let at = |name: &str| folder.path().join(name).display().to_string();
+        std::fs::hard_link(at("b.mcap"), at("deeper/saved.mcap")).unwrap();
         let all = find(&[at(".").trim_end_matches("/.").to_owned()], None).unwrap();
         let names = all.iter().map(|path| path.strip_prefix(folder.path()).unwrap().display().to_string());
         assert_eq!(names.collect::<Vec<_>>(), ["a.mcap", "b.mcap", "d[1].mcap", "deeper/c.mcap"]);

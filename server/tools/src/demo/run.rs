@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::{Context, Error, Result, anyhow};
+use anyhow::{Context, Result};
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
 use clearway_sim::scenes::town;
@@ -14,7 +14,7 @@ use tokio::time::MissedTickBehavior;
 
 use clearway_daemon::base::clock::now_ns;
 use clearway_daemon::config::{Config, Sender, Udp, Vehicle};
-use clearway_daemon::run::{Running, Server, Setup, StartError};
+use clearway_daemon::run::{Running, Server, Setup};
 use clearway_daemon::status::process;
 use clearway_journal::RecordedMaps;
 use clearway_journal::encode::EncodedMap;
@@ -91,7 +91,7 @@ pub async fn demo(
     let choice = tokio::task::block_in_place(|| SensorChoice::new(sensors));
     let (config, notes) = configuration(&options, &rig(sensors, &choice, 0));
     let validity = Duration::from_millis(config.vehicles[0].maps.valid_ms.into());
-    let running = Server::start(Setup { config, ..Setup::default() }).await.map_err(with_hint)?;
+    let running = Server::start(Setup { config, ..Setup::default() }).await?;
     let nowhere = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
     begun(&DemoEndpoints {
         page: running.page.unwrap_or(nowhere),
@@ -139,6 +139,7 @@ pub async fn demo(
     };
     let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
     every.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    let mut is_undrawn = false;
     loop {
         tokio::select! {
             biased;
@@ -160,7 +161,9 @@ pub async fn demo(
                 let newest = served.newest.borrow().clone();
                 if let Some((map, picture)) = newest.zip(options.picture.as_deref()) {
                     let drawn = tokio::task::block_in_place(|| draw(&map, picture));
-                    drawn.unwrap_or_else(|error| tracing::warn!("picture {}: {error:#}", picture.display()));
+                    if let Err(error) = drawn && !std::mem::replace(&mut is_undrawn, true) {
+                        tracing::warn!("picture {}: {error:#}", picture.display());
+                    }
                 }
             }
         }
@@ -205,17 +208,6 @@ fn draw(map: &EncodedMap, file: &Path) -> Result<()> {
     let unfinished = file.with_extension("png.part");
     std::fs::write(&unfinished, picture::png(layer, &PictureStyle { pixels: 640, ..PictureStyle::default() })?)?;
     Ok(std::fs::rename(&unfinished, file)?)
-}
-
-/// The error of a start, with what to do about a port that was free when the demo looked and in use when its server
-/// started, as happens to two demos that start at once.
-fn with_hint(error: StartError) -> Error {
-    match &error {
-        StartError::Listen { source, .. } if source.kind() == std::io::ErrorKind::AddrInUse => {
-            anyhow!("{error}; another program took this port just now: start the demo again, or with --any-port")
-        }
-        _ => error.into(),
-    }
 }
 
 /// The car; its scene begins at `start_ns`.
@@ -284,20 +276,4 @@ fn configuration(options: &DemoOptions, rig: &Rig) -> (Config, Vec<String>) {
     let other = |index| Vehicle { name: name(index), ..first.clone() };
     config.vehicles.extend((1..options.vehicles).map(other));
     (config, notes)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_port_that_was_taken_meanwhile_is_named_with_what_to_do() {
-        let error = |kind| {
-            let at = "127.0.0.1:50051".parse().unwrap();
-            with_hint(StartError::Listen { what: "grpc", at, source: std::io::Error::from(kind) }).to_string()
-        };
-        let taken = error(std::io::ErrorKind::AddrInUse);
-        assert!(taken.starts_with("grpc.listen 127.0.0.1:50051: ") && taken.ends_with("with --any-port"), "{taken}");
-        assert!(!error(std::io::ErrorKind::PermissionDenied).contains("--any-port"));
-    }
 }

@@ -61,13 +61,13 @@ fn each_thing_that_is_wrong_has_its_words() {
         ("warn", "maps are replayed with the stamps of the recording: readers call them stale", |f| {
             f.has_recorded_stamps = true;
         }),
-        ("warn", "the ground lies 0.4 m below the configured mount of top", |f| {
+        ("warn", "top is 0.4 m higher over the ground than configured", |f| {
             f.sensors[0].mount = Some([0.4, 0.1, 0.0]);
         }),
         (
             "warn",
-            "the ground lies 0.2 m above the configured mount of top, and is tilted by -2.0 deg in pitch and +0.0 \
-             deg in roll",
+            "top is 0.2 m lower over the ground than configured, and the ground is tilted by -2.0 deg in pitch and \
+             +0.0 deg in roll",
             |f| f.sensors[0].mount = Some([-0.2, -2.0, 0.0]),
         ),
         ("warn", "several send the data of top, each in place of the others': a, b", |f| {
