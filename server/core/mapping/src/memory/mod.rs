@@ -174,7 +174,8 @@ impl Memory {
         let Self { places, runs, seen, extended, .. } = self;
         places.resize(extended.x.len(), NOWHERE);
         run_wide(FindPlaces { map_from_ego, sweep: extended, places });
-        (seen.fill(0), runs.clear());
+        seen.fill(0);
+        runs.clear();
         let mut first = 0;
         for run in places.chunk_by(|place, next| place == next) {
             if run[0] != NOWHERE {
