@@ -61,6 +61,8 @@ struct Slot {
     counters: Counters,
     passed_over: PassedOver,
     reasons: Vec<String>,
+    /// That no server publishes the vehicle or the layer.
+    absence: Option<String>,
     ended: Option<ClientError>,
     /// How often a replay has reached its end, and how the reader is told.
     replay_ends: u64,
@@ -237,7 +239,8 @@ impl MapStream {
     /// Why no map comes, worst first: the reasons of the vehicle's state on the server, or why there is no connection
     /// ([`crate::Subscription::reconnects`]). Empty while maps come and in the first second without one.
     pub fn reasons(&self) -> Vec<String> {
-        self.slot.borrow().reasons.clone()
+        let slot = self.slot.borrow();
+        slot.absence.iter().chain(&slot.reasons).cloned().collect()
     }
 
     /// Why the stream has ended; `None` if it has not.
@@ -313,6 +316,7 @@ impl LatestSlot {
             slot.newest = Some(map);
             slot.is_at_end = false;
             slot.reasons.clear();
+            slot.absence = None;
             true
         });
     }
@@ -321,6 +325,15 @@ impl LatestSlot {
     pub(crate) fn set_reasons(&self, reasons: Vec<String>) {
         self.slot.send_if_modified(|slot| {
             slot.reasons = reasons;
+            false
+        });
+    }
+
+    /// Sets that no server publishes the vehicle or the layer: the worst reason why no map comes, until one is stored.
+    #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "over gRPC the server refuses a wrong name"))]
+    pub(crate) fn set_absence(&self, absence: Option<String>) {
+        self.slot.send_if_modified(|slot| {
+            slot.absence = absence.filter(|_| slot.newest.is_none());
             false
         });
     }

@@ -318,7 +318,7 @@ fn an_unknown_word_or_option_is_refused_with_what_the_subcommand_has() {
         assert!(output.status.code() == Some(3) && error.contains(tip) && !error.contains("'-- "), "{error}");
     }
     assert!(text(&clearway(&["help", "watch"]).stdout).contains("Usage: clearway watch"));
-    assert!(text(&clearway(&["transport", "--help"]).stdout).contains("[alias: speed]"));
+    assert!(text(&clearway(&["transport", "--help"]).stdout).contains("`speed` does the same"));
 }
 
 #[test]

@@ -35,25 +35,17 @@ pub(super) async fn subscribe(
         }
         let Ok(status) = serde_json::from_slice::<Value>(&payload.to_bytes()) else { return };
         let Some(reasons) = status["reasons"].as_array() else { return };
-        // A vehicle that is well does not say why a layer that it does not have does not come.
-        if !reasons.is_empty() || slot.has_map() {
-            slot.set_reasons(reasons.iter().filter_map(Value::as_str).map(str::to_owned).collect());
-        }
+        slot.set_reasons(reasons.iter().filter_map(Value::as_str).map(str::to_owned).collect());
     });
     subscriber.await.map_err(failed(format!("subscribe to {key}")))
 }
 
 /// Tells the slot once a second, until it has a map, that no server publishes the vehicle or the layer, if none does.
 pub(super) async fn tell_absence(session: &Session, layer: &LayerKey, slot: &LatestSlot) {
-    let mut was_absent = false;
     while !slot.has_map() {
         tokio::time::sleep(ABSENCE_PERIOD).await;
         // The session is closed.
         let Ok(absence) = layer.absence(session).await else { return };
-        let is_absent = absence.is_some();
-        if (is_absent || was_absent) && !slot.has_map() {
-            slot.set_reasons(absence.into_iter().collect());
-        }
-        was_absent = is_absent;
+        slot.set_absence(absence);
     }
 }

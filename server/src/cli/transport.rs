@@ -63,8 +63,8 @@ enum TransportRequest {
         #[arg(long, conflicts_with_all = ["from", "to"])]
         all: bool,
     },
-    /// Set the speed: 0.1 to 1000 times the recorded one, or max.
-    #[command(visible_alias = "speed")]
+    /// Set the speed: 0.1 to 1000 times the recorded one, or max; `speed` does the same.
+    #[command(alias = "speed")]
     Rate {
         /// A factor, or max.
         rate: ReplaySpeed,
