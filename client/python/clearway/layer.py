@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -188,7 +187,7 @@ class Layer:
         shares = [f"{name} {count / sum(counts):.0%}" for name, count in zip(self.legend, counts) if count]
         return f"<Layer {self.name}, {self.grid}: {', '.join(shares) or 'no classes'}; {', '.join(self.channels)}>"
 
-    @cached_property
+    @property
     def _asked(self) -> Asked:
         kinds = {Meaning.FREE: FREE, Meaning.LOW: LOW}
         by_class = [kinds.get(entry.meaning, BLOCKS) for entry in self.legend_entries]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -130,7 +129,7 @@ class Asked:
         free = (kinds == FREE) | (passes_low & (kinds == LOW))
         reach = min(math.ceil(most_m / self._grid.cell_m + 0.5), height + width)
         down = _halves(_steps_down(free, reach))
-        squared = down.copy()
+        squared: np.ndarray = down.copy()
         for by in range(1, min(reach, width) + 1):
             away = _halves(np.int64(by))
             if away >= squared.max():
@@ -168,19 +167,17 @@ class Asked:
         left, low = (np.floor(of - slack).clip(-1, most).astype(np.int64) for of in first)
         right, high = (np.floor(of + slack).clip(-1, most).astype(np.int64) + 1 for of in last)
         is_inside = (left >= 0) & (low >= 0) & (right <= grid.width) & (high <= grid.height)
-        before = self._others_before
-        left, right, low, high = (np.where(is_inside, of, 0) for of in (left, right, low, high))
+        if not is_inside.any():
+            return np.zeros(len(poses), dtype=bool)
+        row, column = low[is_inside].min(), left[is_inside].min()
+        near = self._classes.reshape(grid.shape)[row : high[is_inside].max(), column : right[is_inside].max()]
+        # For each corner of the cells near the path: how many that are not free lie in the rows and columns before it.
+        before = np.pad((self._kinds != FREE)[near].cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+        low, high = (np.where(is_inside, of - row, 0) for of in (low, high))
+        left, right = (np.where(is_inside, of - column, 0) for of in (left, right))
         others = before[high, right] - before[low, right] - before[high, left] + before[low, left]
         are_free: np.ndarray = (is_inside & (others == 0)).all(axis=1)
         return are_free
-
-    @cached_property
-    def _others_before(self) -> np.ndarray:
-        """For each corner of the cells: how many cells that are not free lie in rows and columns before it."""
-        height, width = self._grid.shape
-        before = np.zeros((height + 1, width + 1), dtype=np.int64)
-        before[1:, 1:] = (self._kinds != FREE)[self._classes].reshape(height, width).cumsum(0).cumsum(1)
-        return before
 
     def _answer(self, corners: list[Point], start: Point) -> Answer:
         cells, outside = touched(self._grid, corners)

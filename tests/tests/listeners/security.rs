@@ -41,7 +41,7 @@ async fn a_server_without_client_ca_is_readable_over_tls_only() {
     assert!(matches!(believed, Err(ClientError::Unreachable { .. })), "{believed:?}");
     let address = running.grpc.unwrap().to_string();
     let plain = within("an answer", async { Client::connect(&address).await?.vehicles().await }).await;
-    assert!(plain.as_ref().is_err_and(|error| error.to_string().contains("there encrypts")), "{plain:?}");
+    assert!(matches!(plain, Err(ClientError::Unreachable { .. })), "{plain:?}");
     within("shutdown", running.shutdown()).await.unwrap();
 }
 

@@ -55,8 +55,8 @@ pub(crate) struct Memory {
     azimuths: AzimuthColumns,
     /// By point of the newest map's own: index of its stored cell, or [`NOWHERE`].
     places: Vec<u32>,
-    /// The newest map's own points that follow each other in one cell, and their stored cell. Neighbours of a ring mostly
-    /// share one.
+    /// The newest map's own points that follow each other in one cell, and their stored cell. Neighbours of a ring
+    /// mostly share one.
     runs: Vec<(u32, Range<usize>)>,
     /// One bit for each stored cell, set if the newest map has a point there.
     seen: Vec<u64>,

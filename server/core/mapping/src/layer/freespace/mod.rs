@@ -217,7 +217,7 @@ impl LayerMaker for Freespace {
             }
         }
         self.vehicle.iter().for_each(|cell| class[*cell] = FreespaceClass::Vehicle.value());
-        // No ray shows that nothing stands in the rest of a cell that the vehicle fills in part; it stands there itself.
+        // Of a cell that the vehicle fills in part a ray shows the rest at most; the vehicle itself stands there.
         let unseen =
             [FreespaceClass::Unknown, FreespaceClass::Hidden, FreespaceClass::NotReached].map(|unseen| unseen.value());
         for cell in &self.touched {
