@@ -57,6 +57,9 @@ pub fn find(given: &[String], shard: Option<Shard>) -> Result<Vec<PathBuf>> {
             files.extend(matched);
         }
     }
+    // A saved part is a hard link: a file with several names is found by its first one alone.
+    let mut seen = BTreeSet::new();
+    files.retain(|path| path.metadata().map_or(true, |of| seen.insert((of.dev(), of.ino()))));
     let Some(Shard { index, count }) = shard else { return Ok(files.into_iter().collect()) };
     Ok(files.into_iter().skip(index - 1).step_by(count).collect())
 }
@@ -81,13 +84,11 @@ fn in_store(url: &str) -> Result<Vec<PathBuf>> {
     bail!("{url}: this clearway was built without the feature store");
 }
 
-/// The files that match a pattern; a file with several names (a saved part is a hard link) by its first one alone.
+/// The files that match a pattern.
 fn matching(pattern: &str) -> Result<Vec<PathBuf>> {
     let paths = glob::glob(pattern).with_context(|| format!("{pattern}: not a pattern"))?;
     let paths: Vec<PathBuf> = paths.collect::<Result<_, _>>()?;
-    let mut seen = BTreeSet::new();
-    let mut is_new = |path: &PathBuf| path.metadata().is_ok_and(|of| of.is_file() && seen.insert((of.dev(), of.ino())));
-    Ok(paths.into_iter().filter(&mut is_new).collect())
+    Ok(paths.into_iter().filter(|path| path.is_file()).collect())
 }
 
 #[cfg(test)]
