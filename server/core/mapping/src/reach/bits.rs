@@ -153,12 +153,16 @@ impl Bits {
         }
     }
 
-    /// Spreads set bits to neighbours along sides of cells as long as they are set in `open`.
-    pub fn flood(&mut self, open: &Self) {
+    /// Spreads set bits to neighbours along sides of cells as long as they are set in `open`. `down` and `up` are
+    /// buffers.
+    pub fn flood(&mut self, open: &Self, [down, up]: &mut [Vec<bool>; 2]) {
         let rows = open.words.len() / open.stride;
         self.words.iter_mut().zip(&open.words).for_each(|(word, open)| *word = fill(*word, *open));
         // Rows that have grown since they were last spread down, and up.
-        let [mut down, mut up] = [(); 2].map(|()| vec![true; rows]);
+        for grown in [&mut *down, &mut *up] {
+            grown.clear();
+            grown.resize(rows, true);
+        }
         loop {
             let mut grown = false;
             // Down and up; a path that turns back needs another round.

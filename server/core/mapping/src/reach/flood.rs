@@ -16,6 +16,8 @@ pub struct Flood {
     covered: Bits,
     /// One row, as wide as the disc makes it so far; a buffer.
     wide: Vec<u64>,
+    /// Buffers of [`Bits::flood`].
+    grown: [Vec<bool>; 2],
 }
 
 impl Flood {
@@ -29,6 +31,7 @@ impl Flood {
             reached: bits.clone(),
             covered: bits,
             wide: Vec::new(),
+            grown: Default::default(),
         }
     }
 
@@ -36,7 +39,7 @@ impl Flood {
     /// over open cells. `stages` are sets of cells, each within the next: a cell is reached only over cells of the
     /// first set that contains it.
     pub fn run(&mut self, open: &Bits, closed: &Bits, radius: usize, stages: &[Bits]) {
-        let Self { width, passable, near, reached, covered, wide } = self;
+        let Self { width, passable, near, reached, covered, wide, grown } = self;
         passable.clear();
         passable.dilate(closed, radius, wide);
         passable.words.iter_mut().zip(&open.words).for_each(|(passable, open)| *passable = open & !*passable);
@@ -50,11 +53,11 @@ impl Flood {
         for stage in stages {
             let words = near.words.iter_mut().zip(&passable.words).zip(&stage.words);
             words.for_each(|((near, passable), stage)| *near = passable & stage);
-            reached.flood(near);
+            reached.flood(near, grown);
             let words = passable.words.iter_mut().zip(&reached.words).zip(&stage.words);
             words.for_each(|((passable, reached), stage)| *passable &= reached | !stage);
         }
-        reached.flood(passable);
+        reached.flood(passable, grown);
         covered.clear();
         covered.dilate(reached, radius, wide);
     }
