@@ -188,7 +188,8 @@ async fn agree(rust: &mut MapStream, other: &mut Planner, last: Option<(u64, u64
         let path = clearway_client::Path::Arc { curvature_per_m, length_m };
         let met = map.along(LAYER, &path, &CAR).expect("an answer");
         let expected = json!([met.length_m, place(met.low), place(met.blocked)]);
-        let found = other.ask(&format!("arc {LAYER} 3.6 1.0 1.8 {curvature_per_m} {length_m}"));
+        let Outline { front_m, rear_m, width_m } = CAR;
+        let found = other.ask(&format!("arc {LAYER} {front_m} {rear_m} {width_m} {curvature_per_m} {length_m}"));
         assert!(is_same(&found, &expected), "{found}, not {expected}");
     }
     let nearest = map.nearest_obstacle(LAYER, [1.0, 2.0], None).expect("an answer");
