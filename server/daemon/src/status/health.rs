@@ -152,8 +152,8 @@ impl Health {
             self.better_since = None;
         } else {
             let since = *self.better_since.get_or_insert(facts.up);
-            // The first maps of a server are no recovery.
-            if self.was_better && facts.up.saturating_sub(since) < BETTER_AFTER {
+            // The first maps of a server are no recovery, and neither is a pause that a user asked for.
+            if self.was_better && !is_paused(facts) && facts.up.saturating_sub(since) < BETTER_AFTER {
                 return false;
             }
             (self.was_better, self.better_since) = (true, None);
@@ -221,6 +221,10 @@ fn standing(facts: &Facts) -> Option<String> {
     }
 }
 
+fn is_paused(facts: &Facts) -> bool {
+    matches!(facts.replay, Some((ReplayPhase::Paused, _)))
+}
+
 /// True if packets and maps are expected: of live sensors, and of a replay that has played for a while.
 fn expects_data(facts: &Facts) -> bool {
     let plays = |(_, since)| standing(facts).is_none() && since > SILENT_AFTER;
@@ -259,8 +263,7 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
     let standing = standing(facts);
     let stands = standing.is_some();
     // A pause is what a user asked for, and so is what follows from it.
-    let is_paused = matches!(facts.replay, Some((ReplayPhase::Paused, _)));
-    let warn = if is_paused { State::Ok } else { State::Warn };
+    let warn = if is_paused(facts) { State::Ok } else { State::Warn };
     standing.into_iter().for_each(|why| add(warn, why));
     let Some(age) = facts.map_age else {
         if expects_data(facts) {
