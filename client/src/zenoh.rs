@@ -268,8 +268,8 @@ impl ZenohClient {
     }
 }
 
-/// The error of a session that could not be opened. zenoh says the same of a router that is not there and of one that
-/// refuses a certificate.
+/// The error of a session that could not be opened. zenoh has the same words for a missing router and for a refused
+/// certificate.
 fn unconnected(endpoint: &str, error: zenoh::Error) -> ClientError {
     if !error.to_string().contains("Unable to connect") {
         return failed(format!("connect to {endpoint}"))(error);

@@ -51,7 +51,7 @@ test("a layer over another one leaves what it does not know, and mixes the rest"
   assert.deepEqual(road[1], [4, 5, 6], "only the road is drawn over");
 });
 
-test("cells of which nothing is known are quiet, and all others are plain", () => {
+test("unknown cells are quiet, and all others are plain", () => {
   const { pixels } = frameOf({ a: [CLASSES] });
   assert.deepEqual([...pixels].map((pixel) => pixel >>> 24), [255, 255, 255, 128]);
 });

@@ -23,7 +23,7 @@ from .v1 import map_pb2
 
 #: Longest time after its capture for which a map is believed to be valid (the Rust client's view.rs).
 _VALID_NS_MAX = 60_000_000_000
-#: Most maps of which some layers have arrived. Ours: layers of one map arrive together.
+#: Most maps that still miss layers. Ours: layers of one map arrive together.
 _MAPS_BEGUN_MAX = 16
 
 
@@ -234,7 +234,7 @@ class LayerCollector:
 
     def __init__(self, layers: Sequence[str]) -> None:
         self._layers = list(dict.fromkeys(layers))
-        #: Parts of the maps that began last, by run and sequence: a false part does not replace those of a true map.
+        #: Parts of the maps that began last, by run and sequence: a false part does not replace a true one.
         self._parts: dict[tuple[int, int], dict[str, bytes]] = {}
 
     def add(self, part: bytes, message: map_pb2.Map) -> list[bytes]:

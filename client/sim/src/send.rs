@@ -95,7 +95,7 @@ pub fn drive(
             Kind::Telemetry => (telemetry, &mut sent.telemetry),
         };
         let send = || socket.send_to(&datagram.payload, to);
-        // The answer to an earlier datagram, in place of which this one was not sent.
+        // The answer to an earlier datagram: this one was not sent.
         let is_refused = |sent: &io::Result<usize>| {
             sent.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused)
         };

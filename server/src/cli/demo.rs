@@ -15,9 +15,9 @@ use super::shared::output::{block_on, print_line, stop_signal};
 
 /// Drive a simulated car against a server of its own, over real UDP, and serve its maps.
 ///
-/// A simulation that is too slow for this machine skips time and reports it. A recording runs, of which the page keeps
-/// the last seconds when asked (a black box); without --record it is in the temporary folder, and the rest of it is
-/// deleted at the end. The newest map is drawn to target/demo.png, or demo.png in the temporary folder. The last lines
+/// A simulation that is too slow for this machine skips time and reports it. The drive is recorded, and the page saves
+/// its last seconds when asked (a black box); without --record the recording is in the temporary folder, and all but
+/// the saves is deleted at the end. The newest map is drawn to target/demo.png, or demo.png in the temporary folder. The last lines
 /// say what is left on the disk, and what the maps cost.
 #[derive(Args)]
 #[command(after_help = "Examples:
@@ -66,7 +66,7 @@ async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
     let folder = std::env::temp_dir().join(format!("clearway-demo-{}", std::process::id()));
     let black_box = record.is_none();
     if black_box {
-        std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+        std::fs::create_dir(&folder).with_context(|| folder.display().to_string())?;
     }
     let file = record.unwrap_or_else(|| folder.join("drive.mcap"));
     let (record, drawn, vehicles) = (Some(file.clone()), Some(picture.clone()), vehicles.into());

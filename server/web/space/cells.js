@@ -2,9 +2,8 @@
 // the Worker.
 //
 // Each cell is a quad in the plane of its ground (ground.js). Around cells of a class in OBSTACLES stands an outline,
-// as high as the layer says, else OBSTACLE_M, and seen through but for its rim. Cells of which nothing is known are not
-// drawn. Neighbours of one colour in one plane are one quad; only terrain's quads are drawn one by one, as in Neuhaus
-// 2009, figure 4.
+// as high as the layer says, else OBSTACLE_M, and seen through but for its rim. Unknown cells are not drawn. Neighbours
+// of one colour in one plane are one quad; only terrain's quads are drawn one by one, as in Neuhaus 2009, figure 4.
 
 import { overlayColours } from "../draw/paint.js";
 import { legendByMeaning, word } from "../draw/palette.js";

@@ -25,7 +25,7 @@ pub struct Floor {
 
 impl Floor {
     pub fn new(scan: &Scan) -> Self {
-        // One class where a point fell, another elsewhere: runs as long as those of a map.
+        // One class where a point fell, another elsewhere: runs as long as in a map.
         let mut classes = vec![0; SIDE * SIDE];
         for (&x, &y) in scan.x.iter().zip(&scan.y) {
             if let Some(cell) = square_cell(x, y) {

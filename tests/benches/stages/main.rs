@@ -11,6 +11,7 @@
 //! | decode | the datagrams of a revolution -> the revolution | each return once through a table of sines and cosines |
 //! | a layer | a scan event -> a map of that layer alone, with its ground and reach | see [`Floor`] |
 //! | occupancy_six_units | the scans of six sensors in 100 ms -> the layer | |
+//! | occupancy_six_units_paper | the same, as published: one line of Bresenham for each return | |
 //! | maps | a scan event -> a map of all six layers | |
 //! | shared | a scan -> its points, their ground and reach: what all layers have in common | |
 //! | freespace | a scan event -> the bytes of `freespace`, when nothing else is wanted | |
@@ -34,7 +35,9 @@ use clearway_journal::encode::EncodedMap;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::{Sensor, SensorConfig as LidarConfig};
-use clearway_mapping::config::{Extrinsics, MapsConfig, OccupancyConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::{
+    Extrinsics, MapsConfig, OccupancyConfig, OccupancyVariant, SensorConfig, VehicleConfig,
+};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
 use clearway_mapping::ground::Ground;
 use clearway_mapping::layer::occupancy::Occupancy;
@@ -145,6 +148,7 @@ struct Stages {
     pipelines: BTreeMap<&'static str, Pipeline>,
     of_packets: BTreeMap<&'static str, OfPackets>,
     six_units: SixUnits,
+    six_units_paper: SixUnits,
     shared: Shared,
     floor: Floor,
     /// Number of runs so far: the stamps of a stage rise.
@@ -152,7 +156,7 @@ struct Stages {
 }
 
 impl Stages {
-    const NAMES: [&'static str; 14] = [
+    const NAMES: [&'static str; 15] = [
         "decode",
         "drivability",
         "height_difference",
@@ -161,6 +165,7 @@ impl Stages {
         "speed",
         "safe_path",
         "occupancy_six_units",
+        "occupancy_six_units_paper",
         "shared",
         "maps",
         "freespace",
@@ -194,7 +199,8 @@ impl Stages {
             of_packets: [("freespace_of_packets", &["freespace"][..]), ("maps_of_packets", &LAYERS)]
                 .map(|(stage, layers)| (stage, OfPackets { vehicle: vehicle.clone(), pipeline: pipeline(1.9, layers) }))
                 .into(),
-            six_units: SixUnits::new(),
+            six_units: SixUnits::new(OccupancyVariant::Polar),
+            six_units_paper: SixUnits::new(OccupancyVariant::Paper),
             shared: Shared::new(height_m),
             floor: Floor::new(&scan),
             scan,
@@ -218,6 +224,7 @@ impl Stages {
                 firings
             }),
             "occupancy_six_units" => timed(|| self.six_units.run()),
+            "occupancy_six_units_paper" => timed(|| self.six_units_paper.run()),
             "shared" => timed(|| self.shared.run(&self.scan)),
             name if let Some(stage) = self.of_packets.get_mut(name) => stage.run(),
             _ => {
@@ -327,10 +334,10 @@ struct SixUnits {
 }
 
 impl SixUnits {
-    fn new() -> Self {
+    fn new(variant: OccupancyVariant) -> Self {
         let scans = traffic::scans_of_six_units().into_iter();
         let scans = scans.map(|([x, y, z], origin_m)| (Sweep { x, y, z, ..Sweep::default() }, origin_m)).collect();
-        let maker = Occupancy::new(&OccupancyConfig::default());
+        let maker = Occupancy::new(&OccupancyConfig { variant, ..OccupancyConfig::default() });
         Self { scans, layer: maker.layer(), maker }
     }
 

@@ -23,7 +23,6 @@ use clearway_mapping::sensor::motion::{EgoTrajectory, Motion};
 use clearway_mapping::sensor::ring_series::RingSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::scanner::ScannerConfig;
-use clearway_sim::traffic;
 use clearway_sim::vehicle::SimulatedVehicle;
 use divan::Bencher;
 use divan::counter::ItemsCount;
@@ -190,39 +189,6 @@ fn safe_path(bencher: Bencher) {
     let mut layer = map.layer();
     let context = Context { earlier: &earlier, ..Context::default() };
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &context, &mut layer));
-}
-
-/// Scans of 100 ms from six sensors on a vehicle in traffic, with the position of each sensor.
-fn six_units() -> Vec<(Sweep, [f32; 3])> {
-    let scans = traffic::scans_of_six_units().into_iter();
-    scans.map(|([x, y, z], origin_m)| (Sweep { x, y, z, ..Sweep::default() }, origin_m)).collect()
-}
-
-/// Integrates all scans of 100 ms, and makes the layer.
-#[divan::bench(args = [OccupancyVariant::Polar, OccupancyVariant::Paper])]
-fn occupancy_of_six_units(bencher: Bencher, variant: OccupancyVariant) {
-    let scans = six_units();
-    let mut map = Occupancy::new(&OccupancyConfig { variant, ..OccupancyConfig::default() });
-    let mut layer = map.layer();
-    let pose = Some(nalgebra::Isometry3::identity());
-    let context = Context { map_from_ego: pose, ..Context::default() };
-    bencher.counter(ItemsCount::new(52_800_usize)).bench_local(|| {
-        for (number, (returns, origin_m)) in scans.iter().enumerate() {
-            let rays = Rays {
-                sensor: (number % 6) as u16,
-                stamp_ns: 0,
-                returns,
-                heights_m: &returns.z,
-                origin_m: *origin_m,
-                origin_height_m: origin_m[2],
-                no_returns: &[],
-                map_from_ego: pose,
-                speed_mps: Some(0.0),
-            };
-            map.integrate(&rays);
-        }
-        map.make(&Sweep::default(), &context, &mut layer);
-    });
 }
 
 /// Integrates one revolution of an HDL-64E, and makes the layer.

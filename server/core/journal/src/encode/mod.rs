@@ -3,7 +3,7 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`map`] | map -> header chunk and layer chunks, once |
-//! | `replayed` | the header of a map -> that of the same map in a replay |
+//! | `replayed` | the header of a map -> its header in a replay |
 //! | [`payload_cache`] | an encoded map -> a region of it, a delta of it, once for all readers that need the same |
 //! | [`event`] | event <-> the journal's bytes; observations -> event bodies |
 

@@ -2,7 +2,7 @@
 
 use clearway_proto::v1;
 
-/// How the header of a replayed map differs from that of the recorded one ([`v1::Replay`]).
+/// How the header of a replayed map differs from the recorded header ([`v1::Replay`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Replayed {
     /// What is added to the stamps, in ns.

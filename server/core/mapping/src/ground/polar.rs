@@ -169,7 +169,7 @@ fn cell_and_key(outline: &Outline, [x, y, z]: [f32; 3], [row, turn]: [f32; 2]) -
 }
 
 /// Computes the coordinates of a position: rows outward from [`RANGE_M_MIN`], columns counter-clockwise, both with a
-/// fraction. The row of a nearer one is 0, that of a farther one [`ROWS`].
+/// fraction. A nearer position has the row 0, a farther one [`ROWS`].
 #[inline(always)]
 fn coordinates(azimuths: &AzimuthColumns, x: f32, y: f32) -> [f32; 2] {
     let (least, most) = (RANGE_M_MIN * RANGE_M_MIN, RANGE_M_MAX * RANGE_M_MAX);

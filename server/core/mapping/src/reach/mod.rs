@@ -189,7 +189,7 @@ impl Reach {
         &self.config
     }
 
-    /// Finds closed cells and open ground. `ground` is that of `sweep`. What the vehicle reaches is old until
+    /// Finds closed cells and open ground. `ground` was estimated from `sweep`. What the vehicle reaches is old until
     /// [`Self::flood`].
     pub fn update(&mut self, sweep: &Sweep, ground: &Ground) {
         let own = sweep.x.len() - sweep.remembered;

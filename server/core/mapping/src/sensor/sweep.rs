@@ -351,7 +351,7 @@ impl Sweep {
     }
 }
 
-/// Moves points by one transform, finds those that a sweep keeps, and counts the positions and the returns.
+/// Moves points by one transform, finds which of them a sweep keeps, and counts the positions and the returns.
 struct MoveAtRest<'a> {
     points: [&'a [f32]; 3],
     mount: &'a Mount,
