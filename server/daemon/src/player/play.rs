@@ -430,16 +430,16 @@ impl Player {
             let ReplayedVehicle { engine, events, .. } = &mut self.vehicles[vehicle];
             let before = engine.maps();
             events.try_iter().for_each(|queued| engine.step_silently(&queued.event));
-            if engine.maps() > before {
+            if let Some(map) = engine.pipeline.newest_map().filter(|map| map.sequence >= before) {
+                self.clock.note_map(self.state.position_ns, map.capture_end_ns);
                 self.copy_if_due();
             }
         }
         self.state.position_ns = to_ns;
         self.clock.restart(Some(to_ns));
-        let now_ns = now_ns();
         let (clock, state, boot_id) = (&self.clock, &self.state, self.options.boot_id);
         for ReplayedVehicle { engine, .. } in &mut self.vehicles {
-            engine.replayed = clock.replayed(state, boot_id, to_ns, now_ns);
+            engine.replayed = clock.replayed(state, boot_id, to_ns, now_ns());
             engine.publish_newest_map();
         }
         if self.state.phase() == ReplayPhase::Ended {
