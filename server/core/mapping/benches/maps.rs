@@ -143,7 +143,7 @@ fn terrain_with_roughness(bencher: Bencher) {
     let (revolution, mount) = (revolution(), mount(1.9));
     let mut sweep = Sweep::default();
     sweep.set_revolution(&revolution, &mount);
-    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), 0.02, None);
+    sweep.set_deviations(&revolution, &mut DistanceSeries::default(), 0.02);
     let mut map = Terrain::new(&TerrainConfig::default());
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
@@ -151,12 +151,11 @@ fn terrain_with_roughness(bencher: Bencher) {
 
 #[divan::bench]
 fn deviations_of_a_revolution(bencher: Bencher) {
-    let (revolution, mount) = (revolution(), mount(1.9));
+    let revolution = revolution();
     let (mut sweep, mut series) = (Sweep::default(), DistanceSeries::default());
+    sweep.set_revolution(&revolution, &mount(1.9));
     let slots = revolution.echoes[0].range_m.len();
-    bencher
-        .counter(ItemsCount::new(slots))
-        .bench_local(|| sweep.set_deviations(&revolution, &mount, &mut series, 0.02, None));
+    bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.set_deviations(&revolution, &mut series, 0.02));
 }
 
 /// With a road of 20 points, 6 m wide.

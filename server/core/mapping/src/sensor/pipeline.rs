@@ -232,7 +232,7 @@ impl SensorPipeline {
         let removed = sweep.set_moving_revolution(revolution, mount, &self.trajectory.end_from_ego, filter);
         if let Some(series) = &mut self.series {
             let noise_m = self.range_noise_m.unwrap_or(revolution.model.spec().range_noise_m);
-            sweep.set_deviations(revolution, mount, &mut series.of_lasers, noise_m, filter);
+            sweep.set_deviations(revolution, &mut series.of_lasers, noise_m);
         }
         if self.finds_no_returns {
             find_no_returns(revolution, mount, &self.trajectory, filter, &mut scan.no_returns);
@@ -292,7 +292,7 @@ impl SensorPipeline {
             let of_model = || self.model.map_or(RANGE_NOISE_M, |model| model.spec().range_noise_m);
             let noise_m = self.range_noise_m.unwrap_or_else(of_model);
             let deviations_m = series.of_rings.deviations(scan);
-            sweep.set_scan_deviations(scan, &self.mount, deviations_m, noise_m, self.filter.as_ref());
+            sweep.set_scan_deviations(scan, deviations_m, noise_m);
         }
         newest.no_returns.clear();
         if self.finds_no_returns {

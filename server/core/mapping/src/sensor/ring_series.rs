@@ -9,7 +9,7 @@
 
 use crate::sensor::distance_series::REACH;
 use crate::sensor::observation::Scan;
-use crate::sensor::sweep::classify;
+use crate::sensor::transform::classify;
 
 /// Least difference between the azimuths of two rays, radians. Ours: a fiftieth of the finest azimuth step of the
 /// family, and far above the rounding of coordinates.

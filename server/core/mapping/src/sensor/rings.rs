@@ -13,7 +13,7 @@ use clearway_lidar::calibration::{Calibration, LaserCalibration};
 
 use crate::sensor::config::RINGS_MAX;
 use crate::sensor::observation::Scan;
-use crate::sensor::sweep::classify;
+use crate::sensor::transform::classify;
 
 /// Least number of rings that are found in a scan without rings. Ours: a rotating sensor has at least 16, and some of
 /// them may return nothing.

@@ -5,22 +5,20 @@
 //! of radial maps depend on. Compaction, motion compensation and transform are one pass; each firing has one rigid
 //! transform.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
-use crate::sensor::deviation::Deviation;
+use crate::sensor::deviation::{Deviation, PointDeviations, ReturnDeviations, kept};
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{ScanKnots, knots};
-use crate::sensor::observation::{POSITION_M_MAX, Scan};
+use crate::sensor::observation::Scan;
 use crate::sensor::self_filter::{FilterReason, RemovedPoints, SelfFilter};
-use crate::sensor::transform::Transform;
-use crate::wide::{WideLoop, run_wide};
-
-/// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
-const CHUNK: usize = 1024;
+use crate::sensor::transform::{CHUNK, MoveAtRest, MoveReturns, MovedPoints, Transform, classify, is_far};
+use crate::wide::run_wide;
 
 /// How a sensor is mounted on its vehicle.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,6 +49,9 @@ pub struct Sweep {
     /// Deviation of each range from its neighbours. Empty until [`Sweep::set_deviations`] or
     /// [`Sweep::set_scan_deviations`] fills it.
     pub deviation: Vec<Deviation>,
+    /// Whether the sweep has each slot of its revolution, echo after echo, or each point of its scan. Unspecified in a
+    /// sweep of several scans.
+    pub are_kept: Vec<bool>,
     /// Number of returns before the vehicle's own were removed.
     pub returns: u32,
     /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all
@@ -80,134 +81,62 @@ impl Sweep {
         end_from_ego: &[Isometry3<f64>],
         filter: Option<&SelfFilter>,
     ) -> RemovedPoints {
-        match filter {
-            None => self.fill(revolution, mount, end_from_ego, |_| None),
-            Some(filter) => self.fill(revolution, mount, end_from_ego, check(mount, filter)),
-        }
-    }
-
-    fn fill(
-        &mut self,
-        revolution: &Revolution,
-        mount: &Mount,
-        end_from_ego: &[Isometry3<f64>],
-        check: impl Fn([f32; 3]) -> Option<FilterReason>,
-    ) -> RemovedPoints {
         self.prepare(Some(&revolution.calibration), mount);
         let at_rest = Transform::new(&mount.ego_from_sensor);
         let moving = transforms(mount, end_from_ego);
-        let slots: usize = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum();
-        self.reserve(slots);
-        let mut kept = 0;
-        let mut returns = 0;
+        let check = filter.map(|filter| check(mount, filter));
+        let range_m_min = mount.range_m_min;
+        let mut moved = MovedPoints::default();
         let mut removed = RemovedPoints::default();
         for echo in &revolution.echoes {
-            let mut push = |slots: std::ops::Range<usize>, transform: Transform| {
-                let n = slots.len();
-                let range_m = &echo.range_m[slots.clone()][..n];
-                let (x, y, z) = (&echo.x[slots.clone()][..n], &echo.y[slots.clone()][..n], &echo.z[slots][..n]);
-                for i in 0..n {
-                    let range = range_m[i];
-                    let [ex, ey, ez] = transform.apply(x[i], y[i], z[i]);
-                    (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-                    // A slot that has not fired is NaN, one without a return is 0: neither is kept. Every slot is
-                    // written, and `kept` advances past those that are kept, so that the loop has no branch.
-                    returns += u32::from(range > 0.0);
-                    let is_far = range > 0.0 && range >= mount.range_m_min;
-                    let reason = check([x[i], y[i], z[i]]).filter(|_| is_far);
-                    removed.count(reason);
-                    kept += usize::from(is_far && reason.is_none());
-                }
+            let mut push = |slots: Range<usize>, transform: Transform| {
+                let [range_m, x, y, z] = [&echo.range_m, &echo.x, &echo.y, &echo.z].map(|all| &all[slots.clone()]);
+                let points = [x, y, z];
+                let returns = &mut self.returns;
+                run_wide(MoveReturns { range_m, points, range_m_min, transform, moved: &mut moved, returns });
+                self.push_kept(&mut moved, points, check.as_ref(), &mut removed);
             };
             if moving.is_empty() {
-                push(0..echo.range_m.len(), at_rest);
+                let slots = echo.range_m.len();
+                (0..slots).step_by(CHUNK).for_each(|start| push(start..slots.min(start + CHUNK), at_rest));
             } else {
                 for_each_firing(revolution, &moving, &mut push);
             }
         }
-        self.returns = returns;
-        self.truncate(kept);
         removed
     }
 
-    /// Fills in the deviation of each point that [`Sweep::set_moving_revolution`] kept of the same revolution with the
-    /// same filter. `noise_m` is the standard deviation of the sensor's range noise, metres. The deviations of a second
-    /// echo are unknown: it has no series.
-    pub fn set_deviations(
-        &mut self,
-        revolution: &Revolution,
-        mount: &Mount,
-        series: &mut DistanceSeries,
-        noise_m: f32,
-        filter: Option<&SelfFilter>,
-    ) {
+    /// Fills in the deviation of each point that [`Sweep::set_moving_revolution`] kept of the same revolution.
+    /// `noise_m` is the standard deviation of the sensor's range noise, metres. The deviations of a second echo are
+    /// unknown: it has no series.
+    pub fn set_deviations(&mut self, revolution: &Revolution, series: &mut DistanceSeries, noise_m: f32) {
         let first = series.deviations(revolution);
-        match filter {
-            None => self.fill_deviations(revolution, mount, first, noise_m, |_| None),
-            Some(filter) => self.fill_deviations(revolution, mount, first, noise_m, check(mount, filter)),
-        }
-    }
-
-    fn fill_deviations(
-        &mut self,
-        revolution: &Revolution,
-        mount: &Mount,
-        first: &[f32],
-        noise_m: f32,
-        check: impl Fn([f32; 3]) -> Option<FilterReason>,
-    ) {
-        // Without a branch, as in `fill`.
-        let slots = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum::<usize>() + 1;
-        self.deviation.resize(slots, Deviation::UNKNOWN);
-        let (mut kept, mut found) = (0, [Deviation::UNKNOWN; CHUNK]);
+        let Self { deviation, are_kept, .. } = self;
+        let (mut are_kept, mut found) = (&are_kept[..], [Deviation::UNKNOWN; CHUNK]);
+        deviation.clear();
         for (number, echo) in revolution.echoes.iter().enumerate() {
-            let unknown = if number == 0 { 1.0 } else { f32::NAN };
-            for (chunk, (ranges_m, first)) in echo.range_m.chunks(CHUNK).zip(first.chunks(CHUNK)).enumerate() {
-                for (found, (&range_m, &deviation_m)) in found.iter_mut().zip(ranges_m.iter().zip(first)) {
-                    let per_m = unknown / range_m;
-                    *found = Deviation::new(deviation_m * per_m, noise_m * per_m);
-                }
-                for (slot, (&range_m, &found)) in (chunk * CHUNK..).zip(ranges_m.iter().zip(&found)) {
-                    self.deviation[kept] = found;
-                    let is_far = range_m > 0.0 && range_m >= mount.range_m_min;
-                    let at = || [echo.x[slot], echo.y[slot], echo.z[slot]];
-                    kept += usize::from(is_far && check(at()).is_none());
-                }
+            let scale = if number == 0 { 1.0 } else { f32::NAN };
+            for (range_m, deviation_m) in echo.range_m.chunks(CHUNK).zip(first.chunks(CHUNK)) {
+                run_wide(ReturnDeviations { range_m, deviation_m, scale, noise_m, found: &mut found });
+                let (of_chunk, rest) = are_kept.split_at(range_m.len());
+                deviation.extend_from_slice(kept(&mut found, of_chunk));
+                are_kept = rest;
             }
         }
-        self.deviation.truncate(kept);
     }
 
-    /// Fills in the deviation of each point that [`Sweep::set_moving_scan`] kept of the same scan with the same filter.
-    /// `deviations_m` has one entry for each point of the scan, metres ([`crate::sensor::ring_series`]).
-    pub fn set_scan_deviations(
-        &mut self,
-        scan: &Scan,
-        mount: &Mount,
-        deviations_m: &[f32],
-        noise_m: f32,
-        filter: Option<&SelfFilter>,
-    ) {
-        let check = filter.map(|filter| check(mount, filter));
-        // Without a branch, as in `fill`.
-        self.deviation.resize(scan.x.len() + 1, Deviation::UNKNOWN);
-        let (mut kept, mut found, mut keeps) = (0, [Deviation::UNKNOWN; CHUNK], [false; CHUNK]);
+    /// Fills in the deviation of each point that [`Sweep::set_moving_scan`] kept of the same scan. `deviations_m` has
+    /// one entry for each point of the scan, metres ([`crate::sensor::ring_series`]).
+    pub fn set_scan_deviations(&mut self, scan: &Scan, deviations_m: &[f32], noise_m: f32) {
+        let Self { deviation, are_kept, .. } = self;
+        let mut found = [Deviation::UNKNOWN; CHUNK];
+        deviation.clear();
         let points = scan.x.chunks(CHUNK).zip(scan.y.chunks(CHUNK)).zip(scan.z.chunks(CHUNK));
-        for (((xs, ys), zs), deviations_m) in points.zip(deviations_m.chunks(CHUNK)) {
-            let n = xs.len();
-            let (ys, zs, deviations_m) = (&ys[..n], &zs[..n], &deviations_m[..n]);
-            for i in 0..n {
-                let range_m = squared_range(xs[i], ys[i], zs[i]).sqrt();
-                found[i] = Deviation::new(deviations_m[i] / range_m, noise_m / range_m);
-                keeps[i] = Self::keeps(mount, [xs[i], ys[i], zs[i]]);
-            }
-            for i in 0..n {
-                self.deviation[kept] = found[i];
-                let is_removed = check.as_ref().is_some_and(|check| check([xs[i], ys[i], zs[i]]).is_some());
-                kept += usize::from(keeps[i] & !is_removed);
-            }
+        let of_points = deviations_m.chunks(CHUNK).zip(are_kept.chunks(CHUNK));
+        for (((x, y), z), (deviation_m, are_kept)) in points.zip(of_points) {
+            run_wide(PointDeviations { points: [x, y, z], deviation_m, noise_m, found: &mut found });
+            deviation.extend_from_slice(kept(&mut found, are_kept));
         }
-        self.deviation.truncate(kept);
     }
 
     /// Replaces the points by those of a scan of a vehicle at rest, without a self filter. Returns the number of points
@@ -229,44 +158,26 @@ impl Sweep {
         filter: Option<&SelfFilter>,
     ) -> RemovedPoints {
         self.prepare(calibration, mount);
-        let at_rest = Transform::new(&mount.ego_from_sensor);
+        let (transform, range_m_min) = (Transform::new(&mount.ego_from_sensor), mount.range_m_min);
         let moving = transforms(mount, end_from_ego);
         let knots = ScanKnots::from_scan(scan);
         let check = filter.map(|filter| check(mount, filter));
-        self.reserve(scan.x.len());
-        let mut kept = 0;
-        let mut returns = 0;
+        let mut moved = MovedPoints::default();
         let mut removed = RemovedPoints::default();
-        let (mut moved, mut are_far) = ([[0.0; CHUNK]; 3], [false; CHUNK]);
         let chunks = scan.x.chunks(CHUNK).zip(scan.y.chunks(CHUNK)).zip(scan.z.chunks(CHUNK));
-        for (chunk, ((xs, ys), zs)) in chunks.enumerate() {
-            let n = xs.len();
-            let (ys, zs) = (&ys[..n], &zs[..n]);
-            let [ex, ey, ez] = &mut moved;
-            let (ex, ey, ez, are_far) = (&mut ex[..n], &mut ey[..n], &mut ez[..n], &mut are_far[..n]);
-            let (points, moved) = ([xs, ys, zs], [&mut *ex, &mut *ey, &mut *ez]);
+        for (chunk, ((x, y), z)) in chunks.enumerate() {
+            let points = [x, y, z];
             let mut positions = 0;
-            let counts = [&mut positions, &mut returns];
-            run_wide(MoveAtRest { points, mount, transform: at_rest, moved, are_far: &mut *are_far, counts });
-            removed.no_position += n as u64 - u64::from(positions);
-            for i in (0..n).filter(|_| !moving.is_empty()) {
+            let counts = [&mut positions, &mut self.returns];
+            run_wide(MoveAtRest { points, range_m_min, transform, moved: &mut moved, counts });
+            removed.no_position += x.len() as u64 - u64::from(positions);
+            for i in (0..x.len()).filter(|_| !moving.is_empty()) {
                 let (knot, share) = knots.position(scan.offset_ns[chunk * CHUNK + i]);
-                [ex[i], ey[i], ez[i]] = moving[knot].towards(&moving[knot + 1], share).apply(xs[i], ys[i], zs[i]);
+                let between = moving[knot].towards(&moving[knot + 1], share);
+                [moved.x[i], moved.y[i], moved.z[i]] = between.apply(x[i], y[i], z[i]);
             }
-            if let Some(check) = &check {
-                for (i, is_far) in are_far.iter_mut().enumerate().filter(|(_, is_far)| **is_far) {
-                    let reason = check([xs[i], ys[i], zs[i]]);
-                    removed.count(reason);
-                    *is_far = reason.is_none();
-                }
-            }
-            for i in 0..n {
-                (self.x[kept], self.y[kept], self.z[kept]) = (ex[i], ey[i], ez[i]);
-                kept += usize::from(are_far[i]);
-            }
+            self.push_kept(&mut moved, points, check.as_ref(), &mut removed);
         }
-        self.returns = returns;
-        self.truncate(kept);
         removed
     }
 
@@ -326,57 +237,42 @@ impl Sweep {
 
     /// True if [`Sweep::set_scan`] keeps a point at this position, sensor frame, metres.
     pub fn keeps(mount: &Mount, [x, y, z]: [f32; 3]) -> bool {
-        classify(x, y, z).1 & is_far(mount, x, y, z)
+        classify(x, y, z).1 & is_far(mount.range_m_min, x, y, z)
     }
 
     fn prepare(&mut self, calibration: Option<&Arc<Calibration>>, mount: &Mount) {
         self.calibration = calibration.map(Arc::clone);
         let at = mount.ego_from_sensor.translation;
         (self.mount_height_m, self.mount_m) = (at.z as f32, [at.x as f32, at.y as f32]);
+        for axis in [&mut self.x, &mut self.y, &mut self.z] {
+            axis.clear();
+        }
         self.deviation.clear();
+        self.are_kept.clear();
+        self.returns = 0;
     }
 
-    /// Makes the arrays long enough for `slots` points, and for one more that is written and not kept.
-    fn reserve(&mut self, slots: usize) {
-        for axis in [&mut self.x, &mut self.y, &mut self.z] {
-            axis.resize(slots + 1, 0.0);
-        }
-    }
-
-    /// Shortens the arrays to the points that were kept.
-    fn truncate(&mut self, kept: usize) {
-        for axis in [&mut self.x, &mut self.y, &mut self.z] {
-            axis.truncate(kept);
-        }
-    }
-}
-
-/// Moves points by one transform, finds which of them a sweep keeps, and counts the positions and the returns.
-struct MoveAtRest<'a> {
-    points: [&'a [f32]; 3],
-    mount: &'a Mount,
-    transform: Transform,
-    moved: [&'a mut [f32]; 3],
-    are_far: &'a mut [bool],
-    counts: [&'a mut u32; 2],
-}
-
-impl WideLoop for MoveAtRest<'_> {
+    /// Removes from some points, sensor frame, those that the filter refuses, and adds the others as they were moved.
     #[inline(always)]
-    fn run(self) {
-        let Self { points: [xs, ys, zs], mount, transform, moved: [ex, ey, ez], are_far, counts } = self;
-        let n = are_far.len();
-        let (xs, ys, zs, ex, ey, ez) = (&xs[..n], &ys[..n], &zs[..n], &mut ex[..n], &mut ey[..n], &mut ez[..n]);
-        let [mut positions, mut returns] = [0; 2];
-        // Without a branch, so that the compiler vectorises it.
-        for i in 0..n {
-            let (is_position, is_return) = classify(xs[i], ys[i], zs[i]);
-            are_far[i] = is_return & is_far(mount, xs[i], ys[i], zs[i]);
-            (positions, returns) = (positions + u32::from(is_position), returns + u32::from(is_return));
-            [ex[i], ey[i], ez[i]] = transform.apply(xs[i], ys[i], zs[i]);
+    fn push_kept(
+        &mut self,
+        moved: &mut MovedPoints,
+        [x, y, z]: [&[f32]; 3],
+        check: Option<&impl Fn([f32; 3]) -> Option<FilterReason>>,
+        removed: &mut RemovedPoints,
+    ) {
+        if let Some(check) = check {
+            for (i, is_kept) in moved.are_kept[..x.len()].iter_mut().enumerate().filter(|(_, is_kept)| **is_kept) {
+                let reason = check([x[i], y[i], z[i]]);
+                removed.count(reason);
+                *is_kept = reason.is_none();
+            }
         }
-        let [all_positions, all_returns] = counts;
-        (*all_positions, *all_returns) = (*all_positions + positions, *all_returns + returns);
+        self.are_kept.extend_from_slice(&moved.are_kept[..x.len()]);
+        let kept = moved.close_up(x.len());
+        self.x.extend_from_slice(&moved.x[..kept]);
+        self.y.extend_from_slice(&moved.y[..kept]);
+        self.z.extend_from_slice(&moved.z[..kept]);
     }
 }
 
@@ -391,32 +287,9 @@ fn transforms(mount: &Mount, end_from_ego: &[Isometry3<f64>]) -> Vec<Transform> 
     end_from_ego.iter().map(|moved| Transform::new(&(moved * mount.ego_from_sensor))).collect()
 }
 
-/// Whether a point of a scan is a position, and whether it is a return: a position other than the sensor's own.
-#[inline(always)]
-pub(crate) fn classify(x: f32, y: f32, z: f32) -> (bool, bool) {
-    // NaN fails every comparison.
-    let is_position = (x.abs() <= POSITION_M_MAX) & (y.abs() <= POSITION_M_MAX) & (z.abs() <= POSITION_M_MAX);
-    (is_position, is_position & (squared_range(x, y, z) > 0.0))
-}
-
-/// True if a position, sensor frame, metres, is at least `range_m_min` away from the sensor.
-#[inline(always)]
-fn is_far(mount: &Mount, x: f32, y: f32, z: f32) -> bool {
-    squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
-}
-
-#[inline(always)]
-fn squared_range(x: f32, y: f32, z: f32) -> f32 {
-    x * x + y * y + z * z
-}
-
 /// Calls `push` for each firing with its slots and its transform, which is interpolated between the knots.
 #[inline(always)]
-fn for_each_firing(
-    revolution: &Revolution,
-    moving: &[Transform],
-    push: &mut impl FnMut(std::ops::Range<usize>, Transform),
-) {
+fn for_each_firing(revolution: &Revolution, moving: &[Transform], push: &mut impl FnMut(Range<usize>, Transform)) {
     let (firings, lasers) = (&revolution.firings, revolution.lasers);
     let mut knot = knots(firings.len()).zip(moving);
     let Some(mut from) = knot.next() else { return };

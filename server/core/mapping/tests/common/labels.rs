@@ -93,8 +93,7 @@ pub fn labelled_frame_with_deviations() -> (Sweep, Vec<u32>) {
         scan.ring.push(ring);
     }
     let (mut sweep, labels) = labelled_frame();
-    let mount = Mount { ego_from_sensor: nalgebra::Isometry3::identity(), range_m_min: 2.0 };
-    sweep.set_scan_deviations(&scan, &mount, RingSeries::default().deviations(&scan), 0.02, None);
+    sweep.set_scan_deviations(&scan, RingSeries::default().deviations(&scan), 0.02);
     assert_eq!((ring, sweep.deviation.len()), (0, sweep.x.len()));
     (sweep, labels)
 }

@@ -258,7 +258,7 @@ fn simulate(scene: Scene) -> Sweep {
     let revolution = SimulatedVehicle::new(scene, config).true_revolution(1).revolution;
     let mut sweep = Sweep::default();
     sweep.set_revolution(&revolution, &mount);
-    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), 0.02, None);
+    sweep.set_deviations(&revolution, &mut DistanceSeries::default(), 0.02);
     assert_eq!(sweep.deviation.len(), sweep.x.len());
     sweep
 }

@@ -10,6 +10,7 @@
 //! A step of the ground that is higher than the clearance is low too: its higher side. So is a cell without
 //! a return right behind a low one: the thing hides its own back.
 
+use crate::azimuth_columns::floor_to_whole;
 use crate::reach::Reach;
 use crate::reach::bits::Bits;
 use crate::reach::cells::{CELL_M, SIDE, cell, centre_m};
@@ -35,6 +36,9 @@ const ROUGH_MM: i16 = 50;
 const ROUGH_SCORE_MM: std::ops::Range<i16> = 50..110;
 /// Half the side of the box of which a share of 10 to 30 % is rough, in cells.
 const ROUGH_HALF: usize = 8;
+/// Bits of the number of cells of a box: the largest has 17 x 17. A sum of heights, at most 32.767 m in 9 x 9 cells, fits
+/// into the others.
+const CELLS_BITS: u32 = 9;
 /// Score over the least one with which a cell needs no neighbour, millimetres.
 const ALONE_MM: i16 = 80;
 /// The least height of a low step over the clearance, metres. Ours: a step of 0.15 m with the noise of two returns.
@@ -53,11 +57,9 @@ struct SideBox {
 pub struct LowThings {
     /// By cell of the window: highest return, millimetres; [`NONE`] without one.
     top: Vec<i16>,
-    /// By cell of the window: lowest return, 0 without one; and 1 or 0.
+    /// By cell of the window: a [`pair`] of its lowest return, millimetres, and 1; 0 without a return.
     low: Vec<i32>,
-    count: Vec<i32>,
-    low_sums: BoxSums,
-    count_sums: BoxSums,
+    sums: BoxSums,
     /// By cell of the window: mean ground of the box around it; the largest number without returns.
     means: Vec<i16>,
     best: Vec<i16>,
@@ -74,9 +76,7 @@ impl LowThings {
         Self {
             top: vec![NONE; cells],
             low: vec![0; cells],
-            count: vec![0; cells],
-            low_sums: BoxSums::new(),
-            count_sums: BoxSums::new(),
+            sums: BoxSums::new(),
             means: vec![i16::MAX; cells],
             best: vec![NONE; cells],
             scores: vec![NONE; cells],
@@ -97,12 +97,11 @@ impl LowThings {
         for iy in 0..WINDOW {
             let spans = &reach.ground_spans_mm()[(FIRST + iy) * SIDE + FIRST..][..WINDOW];
             let row = iy * WINDOW..(iy + 1) * WINDOW;
-            let heights = self.top[row.clone()].iter_mut().zip(&mut self.low[row.clone()]).zip(&mut self.count[row]);
-            for (((top, low), count), &[lowest, highest]) in heights.zip(spans) {
+            let heights = self.top[row.clone()].iter_mut().zip(&mut self.low[row]);
+            for ((top, low), &[lowest, highest]) in heights.zip(spans) {
                 let is_seen = lowest <= highest;
                 *top = if is_seen { highest } else { NONE };
-                *low = if is_seen { i32::from(lowest) } else { 0 };
-                *count = i32::from(is_seen);
+                *low = if is_seen { pair(lowest.into(), 1) } else { 0 };
             }
         }
     }
@@ -111,11 +110,18 @@ impl LowThings {
     fn score(&mut self) {
         self.scores.fill(NONE);
         for SideBox { half, along, diagonal } in BOXES {
-            self.low_sums.add_up(&self.low, half);
-            self.count_sums.add_up(&self.count, half);
-            let sums = self.low_sums.sums.iter().zip(&self.count_sums.sums);
-            self.means.iter_mut().zip(sums).for_each(|(mean, (sum, count))| {
-                *mean = if *count > 0 { (*sum as f32 / *count as f32) as i32 as i16 } else { i16::MAX };
+            self.sums.add_up(&self.low, half);
+            self.means.iter_mut().zip(&self.sums.sums).for_each(|(mean, sums)| {
+                let [sum, count] = of_pair(*sums);
+                // Towards 0. A cast of a number with a sign has range checks, which would prevent vectorisation.
+                let mm = floor_to_whole((sum as f32 / count as f32).abs().min(f32::from(i16::MAX))) as i16;
+                *mean = if count == 0 {
+                    i16::MAX
+                } else if sum < 0 {
+                    -mm
+                } else {
+                    mm
+                };
             });
             self.best.fill(NONE);
             let axes = [along, along * WINDOW, diagonal * (WINDOW + 1), diagonal * (WINDOW - 1)];
@@ -137,16 +143,14 @@ impl LowThings {
     fn judge(&mut self, reach: &Reach) {
         let clearance_mm = (reach.config().clearance_m * 1000.0) as i16;
         let (even_mm, rough_mm) = (clearance_mm - EVEN_MM, clearance_mm + ROUGH_MM);
-        // From here on `low` and `count` are the rough cells, and those with a score.
-        let flags = self.low.iter_mut().zip(&mut self.count).zip(&self.scores);
-        flags.for_each(|((rough, scored), score)| {
-            *rough = i32::from(ROUGH_SCORE_MM.contains(score));
-            *scored = i32::from(*score > NONE / 2);
+        // From here on `low` and its sums are pairs of the rough cells and of those with a score.
+        self.low.iter_mut().zip(&self.scores).for_each(|(flags, score)| {
+            *flags = pair(i32::from(ROUGH_SCORE_MM.contains(score)), i32::from(*score > NONE / 2));
         });
-        self.low_sums.add_up(&self.low, ROUGH_HALF);
-        self.count_sums.add_up(&self.count, ROUGH_HALF);
+        self.sums.add_up(&self.low, ROUGH_HALF);
         let over = |at: usize, more_mm: i16| {
-            let (rough, scored) = (self.low_sums.sums[at], self.count_sums.sums[at].max(1));
+            let [rough, scored] = of_pair(self.sums.sums[at]);
+            let scored = scored.max(1);
             let raised = i32::from(rough_mm - even_mm) * (10 * rough - scored).clamp(0, 2 * scored) / (2 * scored);
             self.scores[at] >= even_mm + more_mm + raised as i16
         };
@@ -166,12 +170,13 @@ impl LowThings {
                 ends.for_each(|other| self.things.set(FIRST + other % WINDOW, FIRST + other / WINDOW));
             }
         }
-        let (steps, sums) = (&mut self.steps, (&self.low_sums.sums, &self.count_sums.sums));
+        let (steps, sums) = (&mut self.steps, &self.sums.sums);
         let half = (STEP_RANGE_M_MAX / CELL_M) as usize;
         reach.each_step(reach.config().clearance_m + STEP_OVER_M, half, |cell| {
             let (ix, iy) = (cell % SIDE - FIRST, cell / SIDE - FIRST);
             // Grass is full of steps.
-            let is_even = 3 * sums.0[iy * WINDOW + ix] <= sums.1[iy * WINDOW + ix];
+            let [rough, scored] = of_pair(sums[iy * WINDOW + ix]);
+            let is_even = 3 * rough <= scored;
             if is_even && is_within(ix, iy, STEP_RANGE_M_MAX) {
                 steps.set(FIRST + ix, FIRST + iy);
             }
@@ -207,6 +212,18 @@ fn is_within(ix: usize, iy: usize, range_m: f32) -> bool {
     x * x + y * y < range_m * range_m
 }
 
+/// Two sums in one number: a sum, and the number of its cells, which are as many as the largest box has.
+#[inline(always)]
+fn pair(sum: i32, cells: i32) -> i32 {
+    (sum << CELLS_BITS) + cells
+}
+
+/// The sum and the number of cells of a [`pair`].
+#[inline(always)]
+fn of_pair(pair: i32) -> [i32; 2] {
+    [pair >> CELLS_BITS, pair & ((1 << CELLS_BITS) - 1)]
+}
+
 /// By cell of the window: the sum of the values in a square box around it. Values beyond the window are 0.
 #[derive(Clone)]
 struct BoxSums {
@@ -234,12 +251,13 @@ impl BoxSums {
         for (row, sums) in values.chunks_exact(WINDOW).zip(self.along.chunks_exact_mut(WINDOW)) {
             let mut sum = 0;
             for (before, value) in before[half + 1..].iter_mut().zip(row) {
-                sum += value;
+                // A sum of a whole row may wrap: a difference is right all the same.
+                sum = value.wrapping_add(sum);
                 *before = sum;
             }
             before[half + 1 + WINDOW..].fill(sum);
             let ends = before[width..].iter().zip(&before[..WINDOW]);
-            sums.iter_mut().zip(ends).for_each(|(sum, (to, from))| *sum = to - from);
+            sums.iter_mut().zip(ends).for_each(|(sum, (to, from))| *sum = to.wrapping_sub(*from));
         }
         let row = |iy: usize| iy * WINDOW..(iy + 1) * WINDOW;
         self.column_sums.fill(0);
