@@ -5,16 +5,14 @@
 #
 # Gives in FOLDER:
 #   clearway-VERSION-ARCHITECTURE.tar.gz             the production build: the command, its units and configurations
-#   clearway-VERSION-ARCHITECTURE-v3.tar.gz          on x86-64 the same for processors with AVX2; the same maps.
-#                                                    On others glibc says "CPU ISA level is lower than required"
 #   clearway_VERSION_ARCHITECTURE.deb                the Debian package of the first
 #   clearway-VERSION.tar.gz, clearway-*.whl          the Python client, to be built and built
 #   clearway-map-VERSION.tgz                         the decoder for browsers and Node
 #   clearway.cdx.json                                what is in it (CycloneDX)
 #   SHA256SUMS                                       checksums of all these; sha256sum --check SHA256SUMS
 #
-# With BINARY no binary is built: that one is packed. Needs cargo, dpkg-deb, ld, objdump, readelf and strip (binutils),
-# python3 with venv, npm.
+# With BINARY no binary is built: that one is packed. Needs cargo, dpkg-deb, objdump and strip (binutils), python3 with
+# venv, npm.
 set -eu
 
 mkdir -p "${1:?usage: release.sh FOLDER [BINARY]}"
@@ -27,19 +25,6 @@ architecture=$(uname -m)
 root=$(mktemp -d)
 trap 'rm -rf "$root"' EXIT
 
-build() { # processor, as rustc names it
-    # GNU's linker notes the processor in the binary, for glibc; Rust's own linker leaves the note out.
-    RUSTFLAGS="-C target-cpu=$1 -C link-arg=-fuse-ld=bfd -C link-arg=-Wl,-z,$1" cargo build --release --locked \
-        --package clearway --no-default-features --features sqlite,store,zenoh --target-dir "target/release-$1"
-    echo "target/release-$1/release/clearway"
-}
-
-# Refuses a binary that would not say on which processors it runs.
-check_processor() { # binary, processor
-    readelf --notes "$1" | grep -q "x86 ISA needed: .*$2" && return
-    echo "$1 has no note that it needs $2: it was not linked by GNU ld 2.36 or later" >&2 && exit 1
-}
-
 # Refuses a binary that needs more libraries than every Linux with glibc has.
 check_libraries() {
     objdump -p "$1" | sed -n 's/^ *NEEDED *//p' | while read -r library; do
@@ -50,25 +35,18 @@ check_libraries() {
     done
 }
 
-archive() { # binary, suffix
-    version=$("$1" --version | cut -d ' ' -f 2)
-    name=clearway-$version-$architecture$2
-    install -D "$1" "$root/$name/bin/clearway"
-    strip --strip-unneeded "$root/$name/bin/clearway"
-    check_libraries "$root/$name/bin/clearway"
-    cp -R LICENSE README.md CHANGELOG.md SECURITY.md deploy "$root/$name"
-    tar -C "$root" --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" -c "$name" |
-        gzip -9n >"$folder/$name.tar.gz"
-}
-
-case $architecture in x86_64) plain=x86-64 ;; *) plain=generic ;; esac
-binary=${given:-$(build "$plain")}
-archive "$binary" ""
-if [ "$architecture" = x86_64 ] && [ -z "$given" ]; then
-    faster=$(build x86-64-v3)
-    check_processor "$faster" x86-64-v3
-    archive "$faster" -v3
+if [ -z "$given" ]; then
+    cargo build --release --locked --package clearway --no-default-features --features sqlite,store,zenoh
 fi
+binary=${given:-${CARGO_TARGET_DIR:-target}/release/clearway}
+version=$("$binary" --version | cut -d ' ' -f 2)
+name=clearway-$version-$architecture
+install -D "$binary" "$root/$name/bin/clearway"
+strip --strip-unneeded "$root/$name/bin/clearway"
+check_libraries "$root/$name/bin/clearway"
+cp -R LICENSE README.md CHANGELOG.md SECURITY.md deploy "$root/$name"
+tar -C "$root" --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" -c "$name" |
+    gzip -9n >"$folder/$name.tar.gz"
 deploy/debian/make-deb.sh "$binary" "$folder"
 deploy/make-sbom.sh "$folder"
 
