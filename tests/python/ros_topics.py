@@ -57,6 +57,11 @@ def poses(decoded):
     return {**of_header(decoded.header), "poses": [[pose.position.x, pose.position.y] for pose in decoded.poses]}
 
 
+def path(decoded):
+    places = [stamped.pose.position for stamped in decoded.poses]
+    return {**of_header(decoded.header), "poses": [[place.x, place.y] for place in places]}
+
+
 def grid(decoded):
     position, orientation = decoded.info.origin.position, decoded.info.origin.orientation
     return {
@@ -83,6 +88,7 @@ OF_TYPE = {
     "nav_msgs/msg/OccupancyGrid": grid,
     "visualization_msgs/msg/MarkerArray": markers,
     "geometry_msgs/msg/PoseArray": poses,
+    "nav_msgs/msg/Path": path,
     "std_msgs/msg/Bool": lambda decoded: {"data": bool(decoded.data)},
 }
 

@@ -70,6 +70,8 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
     feed(&running, readings).await;
     // As at the end of a replay.
     running.vehicles.0[0].wires.replay_ended.send_replace(true);
+    let plan = newest(&running).plan("tester", &[[0.0, 0.0], [5.0, 1.0]]);
+    running.vehicles.0[0].wires.plans.send(&plan).unwrap();
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
     let received = tokio::task::spawn_blocking(move || {
         venv::run(venv::script("ros_topics.py").args([&endpoint, "7"]), "the script names what it missed")
@@ -78,8 +80,10 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
 
     let map = newest(&running);
     assert_eq!(map.layers().len() as u64, LAYERS);
-    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 7);
+    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 8);
     assert_eq!(received["messages"]["/clearway/car/replay_ended"]["data"], true);
+    let path = &received["messages"]["/clearway/car/plan"];
+    assert_eq!((&path["frame_id"], &path["poses"]), (&json!("car/base_link"), &json!([[0.0, 0.0], [5.0, 1.0]])));
     let states = &received["messages"]["/diagnostics"]["states"];
     let known = states["clearway: car"].as_array().expect("a state of car");
     // A loss is stated only while packets are expected.

@@ -21,7 +21,7 @@ use crate::ingest::queue::EventQueue;
 const PLANS_MAX: u32 = 20;
 
 /// The newest plan of one vehicle; `None` before the first.
-type NewestPlan = Option<Arc<v1::Plan>>;
+pub type NewestPlan = Option<Arc<v1::Plan>>;
 
 /// Why a plan is not taken.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -1,8 +1,9 @@
 //! Maps as ROS 2 topics in the key space of rmw_zenoh, or of zenoh-bridge-ros2dds.
 //!
 //! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the other topics of the layer
-//! ([`ros::topics_of`]), `<namespace>/<vehicle>/replay_ended` (`std_msgs/msg/Bool`: true from the end of a replay until
-//! it is set back), and if configured its pose on `/tf`. For all: their states on `/diagnostics`
+//! ([`ros::topics_of`]), `<namespace>/<vehicle>/plan` (`nav_msgs/msg/Path`: the newest path of the vehicle's planners,
+//! empty without one), `<namespace>/<vehicle>/replay_ended` (`std_msgs/msg/Bool`: true from the end of a replay until it
+//! is set back), and if configured its pose on `/tf`. For all: their states on `/diagnostics`
 //! (`diagnostic_msgs/msg/DiagnosticArray`). All are reliable; clouds, `/tf` and states volatile, the others transient
 //! local with depth 1. rmw_zenoh has a topic under `<domain>/<topic>/<type>/<hash>`, and liveliness tokens under
 //! `@ros2_lv` announce the node and its publishers; the bridge has it under `<topic>`. The payload is CDR, with an
@@ -18,9 +19,11 @@ use std::time::Duration;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::ros::{self, LayerTopic, ShownLayer};
 use crate::encode::viewer::view;
+use clearway_proto::v1;
 use clearway_ros::cdr::{Header, Writer};
 use clearway_ros::published::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};
-use clearway_ros::published::{BOOL, DIAGNOSTIC_ARRAY, Published, TF_MESSAGE};
+use clearway_ros::published::{BOOL, DIAGNOSTIC_ARRAY, PATH, Published, TF_MESSAGE};
+use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 use zenoh::Session;
@@ -32,6 +35,7 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
 use crate::config::Ros2;
+use crate::engine::plans::NewestPlan;
 use crate::status::assess::Assessment;
 use crate::status::{Reader, State, Transport, VehicleStatus, state_changed};
 use crate::zenoh_session::ZenohError;
@@ -82,8 +86,18 @@ impl<'a> Node<'a> {
             };
             tasks.spawn(tf.publish(served.clone(), None, transform));
         }
-        let topic = format!("{}/{vehicle}/replay_ended", self.options.namespace);
-        tasks.spawn(self.topic(&topic, &BOOL, LATCHED).await?.publish_replay_end(served.clone()));
+        let (own, wires, frames) =
+            (format!("{}/{vehicle}", self.options.namespace), &served.wires, served.frames.clone());
+        let path = move |plan: &NewestPlan| ros::path_of(&frames, plan.as_deref().unwrap_or(&v1::Plan::default()));
+        let plans = self.topic(&format!("{own}/plan"), &PATH, LATCHED).await?;
+        tasks.spawn(plans.publish_each(wires.plans.subscribe(), path));
+        let has_ended = |ended: &bool| {
+            let mut message = Writer::default();
+            message.bytes(&[(*ended).into()]);
+            message.finish()
+        };
+        let ends = self.topic(&format!("{own}/replay_ended"), &BOOL, LATCHED).await?;
+        tasks.spawn(ends.publish_each(wires.replay_ended.subscribe(), has_ended));
         Ok(())
     }
 
@@ -265,15 +279,12 @@ impl Topic {
         }
     }
 
-    /// Sends whether a replay has ended, now and whenever that changes, after the last map.
-    async fn publish_replay_end(mut self, served: Served) {
-        let mut ended = served.wires.replay_ended.subscribe();
+    /// Sends the message of a value, now and whenever the value changes.
+    async fn publish_each<T>(mut self, mut values: watch::Receiver<T>, make: impl Fn(&T) -> Vec<u8>) {
         loop {
-            let has_ended = *ended.borrow_and_update();
-            let mut message = Writer::default();
-            message.bytes(&[has_ended.into()]);
-            self.put(Some(message.finish())).await;
-            if ended.changed().await.is_err() {
+            let message = make(&values.borrow_and_update());
+            self.put(Some(message)).await;
+            if values.changed().await.is_err() {
                 return std::future::pending().await;
             }
         }

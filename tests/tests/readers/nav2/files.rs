@@ -55,6 +55,9 @@ fn is_latched(topic: &str) -> Option<bool> {
         || (topic.rsplit('/').next().unwrap_or_default(), String::new()),
         |(layer, ending)| (layer, format!("/{ending}")),
     );
+    if (layer, ending.as_str()) == ("plan", "") {
+        return Some(true);
+    }
     Some(topics_of(layer).iter().find(|topic| topic.ending == ending)?.is_latched)
 }
 
@@ -108,7 +111,7 @@ fn rviz_subscribes_to_published_topics_with_their_durability_and_the_guide_sets_
     let rviz = yaml("clearway.rviz");
     let displays = rviz["Visualization Manager"]["Displays"].as_sequence().expect("displays");
     let topics: Vec<_> = displays.iter().filter_map(|display| display.get("Topic")).collect();
-    assert_eq!(topics.len(), 4);
+    assert_eq!(topics.len(), 5);
     for topic in topics {
         let name = topic["Value"].as_str().expect("a topic");
         let durability = if is_latched(name).expect(name) { "Transient Local" } else { "Volatile" };
