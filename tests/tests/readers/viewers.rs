@@ -13,6 +13,7 @@ use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::run::{Running, Server, Setup};
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
+use clearway_tests::workspace;
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
 use zenoh::handlers::FifoChannelHandler;
@@ -232,6 +233,12 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
     assert_eq!(newest_map["name"], "clearway");
     assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 5);
     assert_eq!(newest_map["channels"]["/car/log"], "foxglove.Log");
+    let layout = std::fs::read_to_string(workspace().join("client/foxglove/clearway.json")).expect("the layout");
+    let panels = serde_json::from_str::<Value>(&layout).expect("JSON")["configById"].clone();
+    let topics = panels["3D!maps"]["topics"].as_object().expect("topics");
+    for topic in topics.keys().map(String::as_str).chain(panels["RosOut!states"]["topicToRender"].as_str()) {
+        assert!(newest_map["channels"].get(topic).is_some(), "the layout names {topic}");
+    }
     assert_eq!(newest_map["/car/log"]["message"], "the replay has ended");
     for name in ["drivability", "occupancy"] {
         let (layer, grid) = (map.layer(name).unwrap(), &newest_map[format!("/car/map/{name}")]);
