@@ -15,6 +15,8 @@ pub const SILENT_AFTER: Duration = Duration::from_secs(2);
 const STALE_ERROR_AFTER: Duration = Duration::from_secs(1);
 /// Time for which a better state must last. Ours: an operator reads one state instead of a flicker.
 const BETTER_AFTER: Duration = Duration::from_secs(3);
+/// Silent sensors that have a reason each; more of them have one in common. Ours: two lines are read at a glance.
+const SILENT_APART_MAX: usize = 2;
 /// Share of lost packets above which a vehicle warns, and below which it no longer does. Ours: 1 % is one packet in
 /// each revolution of a VLP-16 of 76 packets.
 const LOSS_WARNS: f64 = 0.01;
@@ -133,6 +135,8 @@ pub struct Finding {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Health {
     state: State,
+    /// Since when the state lasts.
+    since: Duration,
     reasons: Vec<String>,
     /// Since when a better state lasts.
     better_since: Option<Duration>,
@@ -158,6 +162,9 @@ impl Health {
             }
             (self.was_better, self.better_since) = (true, None);
         }
+        if found != before {
+            self.since = facts.up;
+        }
         self.state = found;
         self.reasons = findings.into_iter().map(|finding| finding.text).collect();
         self.state != before
@@ -166,6 +173,11 @@ impl Health {
     /// The state.
     pub fn state(&self) -> State {
         self.state
+    }
+
+    /// Since when the state lasts, as the time since the server started.
+    pub fn since(&self) -> Duration {
+        self.since
     }
 
     /// Why it is not `ok`, worst first.
@@ -242,9 +254,16 @@ fn silence(facts: &Facts, add: &mut impl FnMut(State, String)) {
         add(State::Error, format!("no packets{from} since the server started {} ago", seconds(facts.up)));
         return;
     }
-    let is_silent = |sensor: &SensorFacts| sensor.silent.unwrap_or(facts.up) > SILENT_AFTER;
-    let state = if facts.sensors.iter().all(is_silent) { State::Error } else { State::Warn };
-    for sensor in facts.sensors.iter().filter(|sensor| is_silent(sensor)) {
+    let age = |sensor: &SensorFacts| sensor.silent.unwrap_or(facts.up);
+    let silent: Vec<_> = facts.sensors.iter().filter(|sensor| age(sensor) > SILENT_AFTER).collect();
+    let state = if silent.len() == facts.sensors.len() { State::Error } else { State::Warn };
+    if silent.len() > SILENT_APART_MAX && !silent.iter().any(|sensor| sensor.is_refused) {
+        let names = silent.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");
+        let longest = seconds(silent.iter().map(|sensor| age(sensor)).max().unwrap_or_default());
+        add(state, format!("{} of {} sensors silent for {longest}: {names}", silent.len(), facts.sensors.len()));
+        return;
+    }
+    for sensor in silent {
         let (name, refused) = (&sensor.name, if sensor.is_refused { "readable " } else { "" });
         add(
             state,
