@@ -101,7 +101,10 @@ impl VehicleStatus {
         history.push_state(facts.up, state, |state| StateChange {
             state,
             reason: reasons.first().cloned().unwrap_or_default(),
-            file: self.recorder.get().map(|counts| counts.to_proto().file).unwrap_or_default(),
+            file: self
+                .recorder
+                .get()
+                .map_or_else(String::new, |counts| counts.to_proto().file.replace(".unfinished.", ".")),
         });
         drop(watched);
         let changing = locked(&self.changing);

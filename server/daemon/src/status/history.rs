@@ -30,7 +30,7 @@ pub struct StateChange {
     pub state: &'static str,
     /// Its worst reason; empty without one.
     pub reason: String,
-    /// File that was recorded then; empty without a recording.
+    /// Part of the recording that was written then, by the name that it has when it is closed; empty without one.
     pub file: String,
 }
 
