@@ -46,7 +46,8 @@ function entry({ at_ms, state, reason, file, lasted_ms }, grafana) {
   item.append(time, " ", badge, ` ${lasted}${reason && `: ${reason}`}`);
   if (file) {
     const recorded = document.createElement("code");
-    setText(recorded, file);
+    setText(recorded, file.split("/").at(-1));
+    recorded.title = file;
     item.append(" · recorded in ", recorded);
   }
   return item;
