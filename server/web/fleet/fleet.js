@@ -175,7 +175,8 @@ export class FleetView {
     card.age_ms = ageOf(status, now_ms - card.status_arrived_ms, shown?.age_ms);
     card.fresh = freshOf(card.age_ms, shown?.validity_ms ?? status.map_valid_ms);
     card.began_ms = beganAt(status, card.status_arrived_ms, card.began_ms);
-    card.speed = status.speed_m_s ?? frame?.header.speed_mps ?? null;
+    // The speed in an old map says nothing about now.
+    card.speed = status.speed_m_s ?? (card.fresh === "fresh" ? frame?.header.speed_mps : null) ?? null;
     const { state, reasons } = stateOf(status);
     element.dataset.fresh = card.fresh;
     element.dataset.state = state ?? "";
@@ -190,6 +191,7 @@ export class FleetView {
     writeValue(parts.speed, card.speed, (speed) => `${speed.toFixed(1)} m/s`);
     parts.reasons.hidden = reasons.length === 0;
     setText(parts.reasons, reasons.join(" · "));
+    parts.reasons.title = parts.reasons.textContent;
   }
 
   #arrange() {
