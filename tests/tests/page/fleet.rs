@@ -13,6 +13,7 @@ use clearway_daemon::run::{Running, Server, Setup};
 use clearway_daemon::status::{State, Transport};
 use tokio::runtime::Runtime;
 
+use crate::fixture::until;
 use crate::page::webdriver::Browser;
 
 const VEHICLES: usize = 50;
@@ -310,6 +311,10 @@ pub fn fifty_vehicles_are_shown() {
         assert!((8..VEHICLES as u32 - 5).contains(&readers()), "maps of {} vehicles are sent", readers());
         browser.until("the vehicles on the map", "return !document.getElementById('where').hidden");
         browser.screenshot("fleet-1440x900");
+        browser.click("#table");
+        until("a table that wants no maps", || readers() == 0).await;
+        browser.screenshot("fleet-table-1440x900");
+        browser.click("#table");
         is_smooth(&browser);
         is_sorted_and_found(&browser);
         // One vehicle, and back.
