@@ -40,7 +40,6 @@ export function newFrame(map, show, raster, ranges) {
     channels: layer.channels.map(({ name }) => name),
     pixels, space, legend, bar,
     radius_m: layer.grid.radius_m,
-    drivable_share: map.layer("drivability")?.metrics.get("drivable_share") ?? null,
     safe_points: show.safe_points ? (map.layer(SAFE_PATH)?.safe_points ?? null) : null,
   };
 

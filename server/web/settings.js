@@ -1,9 +1,11 @@
-// What a reader chose, kept in this browser: the shown layer, what lies over it, rate, colours, order of the fleet.
+// What a reader chose, kept in this browser: the shown layer, what lies over it, rate, colours, order of the fleet,
+// address of Grafana.
 
 const KEY = "clearway.page";
 const DEFAULTS = {
   layer: "freespace", channel: "class", overlays: [], road: false, safe_points: false, trail: true, by_meaning: false,
   space: false, points: false, max_rate_hz: 0, save_data: false, order: "state", only: "all",
+  table: false, grafana: "",
 };
 
 // Reads what was kept. A value of another type than its default is left out, so that no old version harms.

@@ -1,14 +1,14 @@
-// The view of all vehicles: a card for each, sorted and filtered, and where they are. In: the status of each once a
-// second, and frames of the cards in sight. Out: the cards, and what is wanted of the Worker: small maps at a low rate,
-// of the cards in sight alone.
+// The view of all vehicles: a card or a row of a table for each, sorted and filtered, and where they are. In: the
+// status of each once a second, and frames of the cards in sight. Out: the cards, and what is wanted of the Worker:
+// small maps at a low rate, of the cards in sight alone.
 
 import { freshness } from "../clock.js";
-import { dash, duration, percent, setText } from "../text.js";
+import { coarse, dash, percent, setText } from "../text.js";
 import { drawPlaces, vehicleAt } from "./places.js";
-import { addressOf, ageOf, chosen, freshOf, stateOf, tally } from "./state.js";
+import { addressOf, ageOf, beganAt, chosen, freshOf, stateOf, tally } from "./state.js";
 
 const MAP_HZ = 1, MAP_RADIUS_M = 30, MAP_PX = 150, SCALE_MAX = 2;
-// Cards change places this often at most, so that they can be read and clicked.
+// Cards change places this often at most, and not under the pointer, so that they can be read and clicked.
 const ORDER_EVERY_MS = 3000;
 const SIGHT_MARGIN = "100px";
 
@@ -46,6 +46,13 @@ export class FleetView {
         this.#arrange();
       };
     }
+    $("table").checked = settings.table;
+    $("table").onchange = () => {
+      settings.table = $("table").checked;
+      changed();
+      this.#lay();
+    };
+    this.#lay();
     $("find").oninput = () => this.#arrange();
     $("places").onclick = (event) => {
       const box = $("places").getBoundingClientRect();
@@ -64,6 +71,12 @@ export class FleetView {
   close(keep) {
     this.#is_open = false;
     for (const card of this.#cards.values()) this.#want(card, keyOf(card.status) === keep);
+  }
+
+  // As cards, or as a table, which has no maps.
+  #lay() {
+    $("cards").classList.toggle("rows", Boolean(this.#settings.table));
+    for (const card of this.#cards.values()) this.#want(card);
   }
 
   // The status of all vehicles.
@@ -105,7 +118,9 @@ export class FleetView {
     if (!this.#is_open) return;
     const now_ms = performance.now();
     for (const card of this.#cards.values()) this.#writeCard(card, now_ms);
-    if (now_ms - this.#ordered_ms > ORDER_EVERY_MS) this.#arrange();
+    // Another vehicle is shown at once.
+    const is_held = this.#ordered_ms > 0 && $("cards").matches(":hover");
+    if (now_ms - this.#ordered_ms > ORDER_EVERY_MS && !is_held) this.#arrange();
     this.#writeTally();
     const placed = [...this.#cards.values()].map(({ status, fresh, frame }) => ({
       name: keyOf(status), pose: poseOf(status, frame), ...stateOf(status), fresh,
@@ -117,10 +132,10 @@ export class FleetView {
   #newCard(status) {
     const element = $("card").content.firstElementChild.cloneNode(true);
     const part = (name) => element.querySelector(`[data-part="${name}"]`);
-    const names = ["name", "state", "fresh", "age", "hz", "loss", "speed", "reasons", "map"];
+    const names = ["name", "state", "since", "fresh", "age", "hz", "latency", "loss", "speed", "reasons", "map"];
     const card = {
       element, parts: Object.fromEntries(names.map((name) => [name, part(name)])), status, status_arrived_ms: 0,
-      frame: null, is_in_sight: false, is_wanted: false, age_ms: null, fresh: "none", speed: null, maps: [],
+      frame: null, is_in_sight: false, is_wanted: false, age_ms: null, fresh: "none", began_ms: null, speed: null,
     };
     element.dataset.vehicle = keyOf(status);
     const address = addressOf(status);
@@ -134,7 +149,7 @@ export class FleetView {
   }
 
   #want(card, is_kept = false) {
-    const is_wanted = this.#is_open && card.is_in_sight;
+    const is_wanted = this.#is_open && card.is_in_sight && !this.#settings.table;
     const { is_elsewhere } = card.status;
     if (is_wanted === card.is_wanted || is_elsewhere || !card.status.layers?.length) return;
     card.is_wanted = is_wanted;
@@ -159,19 +174,24 @@ export class FleetView {
     const shown = frame && freshness(frame.header, frame.came_ns, this.#clock.now_ns(now_ms));
     card.age_ms = ageOf(status, now_ms - card.status_arrived_ms, shown?.age_ms);
     card.fresh = freshOf(card.age_ms, shown?.validity_ms ?? status.map_valid_ms);
-    card.speed = status.speed_m_s ?? frame?.header.speed_mps ?? null;
+    card.began_ms = beganAt(status, card.status_arrived_ms, card.began_ms);
+    // The speed in an old map says nothing about now.
+    card.speed = status.speed_m_s ?? (card.fresh === "fresh" ? frame?.header.speed_mps : null) ?? null;
     const { state, reasons } = stateOf(status);
     element.dataset.fresh = card.fresh;
     element.dataset.state = state ?? "";
     parts.state.hidden = !state;
     setText(parts.state, state?.toUpperCase() ?? "");
+    setText(parts.since, card.began_ms === null ? "" : coarse(now_ms - card.began_ms));
     setText(parts.fresh, { none: "NO MAP", fresh: "FRESH", stale: "STALE" }[card.fresh]);
-    setText(parts.age, card.age_ms === null ? dash : coarse(card.age_ms));
+    setText(parts.age, coarse(card.age_ms));
     writeValue(parts.hz, status.map_rate_hz, (hz) => `${hz.toFixed(1)} Hz`);
+    writeValue(parts.latency, status.latency_ms?.total, (ms) => `${Math.round(ms)} ms`);
     writeValue(parts.loss, status.loss, (loss) => percent(loss));
     writeValue(parts.speed, card.speed, (speed) => `${speed.toFixed(1)} m/s`);
     parts.reasons.hidden = reasons.length === 0;
     setText(parts.reasons, reasons.join(" · "));
+    parts.reasons.title = parts.reasons.textContent;
   }
 
   #arrange() {
@@ -184,8 +204,9 @@ export class FleetView {
     if (keys.join("\n") !== this.#order) {
       this.#order = keys.join("\n");
       keys.forEach((key, i) => {
-        const { element } = this.#cards.get(key);
-        if ($("cards").children[i] !== element) $("cards").insertBefore(element, $("cards").children[i] ?? null);
+        // The first child names the columns.
+        const { element } = this.#cards.get(key), there = $("cards").children[i + 1] ?? null;
+        if (there !== element) $("cards").insertBefore(element, there);
       });
     }
     $("nothing").hidden = keys.length > 0;
@@ -200,13 +221,10 @@ export class FleetView {
   }
 }
 
-// Ages on cards are coarse: a text that changes ten times a second cannot be read fifty times.
-const coarse = (ms) => (ms < 1000 ? `${Math.max(0.1, Math.round(ms / 100) / 10).toFixed(1)} s` : duration(ms));
-
 function writeValue(element, value, text) {
   const is_known = Number.isFinite(value);
-  element.parentElement.hidden = !is_known;
-  if (is_known) setText(element, text(value));
+  element.parentElement.classList.toggle("unknown", !is_known);
+  setText(element, is_known ? text(value) : dash);
 }
 
 function poseOf(status, frame) {

@@ -3,7 +3,8 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { gridStep, vehicleAt, viewOf } from "./places.js";
-import { addressOf, ageOf, chosen, elsewhere, freshOf, needsCare, stateOf, tally } from "./state.js";
+import { coarse } from "../text.js";
+import { addressOf, ageOf, beganAt, chosen, elsewhere, freshOf, needsCare, stateOf, tally } from "./state.js";
 
 test("a state that the server does not send, or that is unknown, is not shown", () => {
   assert.deepEqual(stateOf(undefined), { state: null, reasons: [] });
@@ -36,12 +37,30 @@ const CARDS = [
 const order = (order, only = "all", text = "") => chosen(CARDS, { order, only, text });
 
 test("vehicles are ordered by state, name, age, loss or speed, and the unknown comes last", () => {
-  assert.deepEqual(order("state"), ["tram", "car 9", "bus", "car 10"]);
+  assert.deepEqual(order("state"), ["tram", "bus", "car 9", "car 10"]);
   assert.deepEqual(order("name"), ["bus", "car 9", "car 10", "tram"]);
   assert.deepEqual(order("age"), ["tram", "bus", "car 9", "car 10"], "a vehicle without a map first");
   assert.deepEqual(order("speed").slice(0, 2), ["car 9", "car 10"]);
   assert.deepEqual(order("loss").slice(0, 2), ["car 9", "car 10"]);
   assert.deepEqual(order("no such order"), order("name"));
+});
+
+test("what needs hands comes first: errors, old maps, warnings, and of two alike what has lasted longer", () => {
+  const of = (name, state, began_ms, fresh = "fresh") => ({ ...card(name, { state }, fresh), began_ms });
+  const cards = [
+    of("a", "ok", 900), of("b", "warn", 500), of("c", "warn", 200), of("d", "ok", 600, "stale"),
+    of("e", "error", 800, "stale"), of("f", "error", 700, "none"), of("g", "warn", null), of("h", "ok", 100),
+  ];
+  const keys = chosen(cards, { order: "state", only: "all", text: "" });
+  assert.equal(keys.join(""), "fedcbgah", "those that are well by name");
+});
+
+test("a state has one beginning in all statuses of it, and how long it lasts is told coarsely", () => {
+  const began = (state_ms, before_ms) => beganAt({ state_ms }, 9000, before_ms);
+  assert.deepEqual([began(5000, null), began(5000, 4400), began(5000, 100)], [4000, 4400, 4000]);
+  assert.equal(began(undefined, 4400), null);
+  const told = [null, 40, 940, 59_900, 185_000, 7.5e6].map(coarse);
+  assert.deepEqual(told, ["–", "0.1 s", "0.9 s", "59 s", "3 min", "2 h 5 min"]);
 });
 
 test("vehicles are found by a part of their name, and by their need of care", () => {

@@ -3,6 +3,8 @@
 const ORDER = { error: 0, warn: 1, ok: 2 };
 // A status arrives once a second. A vehicle without news for longer is silent.
 const NEWS_MS = 2500;
+// Two states begin at least so far apart.
+const SAME_MS = 1500;
 
 // A vehicle of another server, as that server says it. Two servers may claim one name: its card has a key of its own.
 export const elsewhere = (status) => {
@@ -36,6 +38,14 @@ export function ageOf(status, status_age_ms, frame_age_ms) {
 // "fresh", "stale" or "none".
 export const freshOf = (age_ms, validity_ms) => (age_ms === null ? "none" : age_ms <= validity_ms ? "fresh" : "stale");
 
+// When the state began, by the clock of arrived_ms: before_ms, as it was told before, unless it is another state; null
+// if the server does not say it. Statuses are up to half a second old, and an order must not change by that.
+export function beganAt({ state_ms }, arrived_ms, before_ms) {
+  if (!(state_ms > 0)) return null;
+  const began_ms = arrived_ms - state_ms;
+  return before_ms !== null && Math.abs(began_ms - before_ms) < SAME_MS ? before_ms : began_ms;
+}
+
 // A vehicle that is not well: its state says so, or its maps are old.
 export const needsCare = ({ status, fresh }) =>
   ["error", "warn"].includes(stateOf(status).state) || fresh === "stale";
@@ -47,18 +57,22 @@ const byName = (a, b) => natural.compare(a.status.name, b.status.name);
 const descending = (of) => (a, b) => compare(of(b) ?? -Infinity, of(a) ?? -Infinity);
 const ORDERS = {
   name: byName,
-  state: (a, b) => compare(rank(a), rank(b)),
+  // What needs hands first: no maps, old maps, maps with something wrong, and of two alike what has waited longer.
+  state: (a, b) => compare(rank(a), rank(b)) || (rank(a) < WELL ? compare(beganOf(a), beganOf(b)) : 0),
   age: descending(({ age_ms }) => age_ms ?? Infinity),
   loss: descending(({ status }) => status.loss),
   speed: descending(({ speed }) => speed),
 };
 
+const WELL = 3;
+const beganOf = ({ began_ms }) => began_ms ?? Infinity;
+
 function rank(card) {
   const { state } = stateOf(card.status);
-  return state === "error" ? 0 : state === "warn" ? 1 : card.fresh === "stale" ? 2 : 3;
+  return state === "error" ? 0 : card.fresh === "stale" ? 1 : state === "warn" ? 2 : WELL;
 }
 
-// cards: [{ status, age_ms, fresh, speed }]. The keys of those that are shown, in order.
+// cards: [{ status, age_ms, fresh, began_ms, speed }]. The keys of those that are shown, in order.
 export function chosen(cards, { order, only, text }) {
   const wanted = text.trim().toLowerCase();
   const isShown = (card) =>

@@ -3,13 +3,13 @@
 import { duration, percent, setText } from "../text.js";
 import { lines, niceTop } from "./history.js";
 
-// [name of the sample's value, title, the value in words, least value at the upper edge]
+// [name of the row's value, title, the value in words, least value at the upper edge]
 const PLOTS = [
-  ["age_ms", "Age", duration, 200],
-  ["latency_ms", "Latency on the vehicle's server", duration, 100],
-  ["hz", "Maps", (hz) => `${hz.toFixed(1)} Hz`, 10],
+  ["map_age_ms", "Age of the newest map", duration, 200],
+  ["latency_ms_total", "Latency on the vehicle's server", duration, 100],
+  ["map_rate_hz", "Maps", (hz) => `${hz.toFixed(1)} Hz`, 10],
   ["loss", "Packets lost", (share) => percent(share), 0.01],
-  ["share", "Drivable ground", (share) => percent(share, 0), 1],
+  ["drivable_share", "Drivable ground", (share) => percent(share, 0), 1],
 ];
 
 export class Plots {
@@ -32,17 +32,18 @@ export class Plots {
     }
   }
 
-  draw(history, now_ms) {
+  draw(history) {
+    const now_ms = history.rows.at(-1)?.at_ms;
     for (const [name, title, text, least] of PLOTS) {
       const { figure, value, canvas, axis } = this.#parts.get(name);
       figure.hidden = !history.has(name);
       if (figure.hidden) continue;
-      const newest = history.samples.at(-1)[name], top = niceTop(history.samples, name, least);
+      const newest = history.rows.at(-1)[name], top = niceTop(history.rows, name, least);
       setText(value, Number.isFinite(newest) ? text(newest) : "unknown");
       setText(axis.firstChild, "10 min ago");
       setText(axis.lastChild, `full height ${text(top)}`);
       canvas.setAttribute("aria-label", `${title}, the last ten minutes; now ${value.textContent}`);
-      drawLines(canvas, (size) => lines(history.samples, name, now_ms, { ...size, top }));
+      drawLines(canvas, (size) => lines(history.rows, name, now_ms, { ...size, top }));
     }
   }
 }

@@ -9,6 +9,7 @@ import { Space } from "../space/space.js";
 import { stateOf } from "../fleet/state.js";
 import { Layers } from "./layers.js";
 import { MapCanvas } from "./map_canvas.js";
+import { Changes } from "./changes.js";
 import { History } from "./history.js";
 import { Plots } from "./plots.js";
 import { Trail, yawOf } from "./view.js";
@@ -16,7 +17,7 @@ import { Trail, yawOf } from "./view.js";
 const RATE_OVER_MS = 3000;
 // Ages are written ten times a second, which a reader can follow; each text costs the browser a layout.
 const AGE_EVERY_MS = 100;
-const METRICS_EVERY_MS = 500, SAMPLE_EVERY_MS = 1000;
+const METRICS_EVERY_MS = 500;
 // How reasons of the server begin that stand beside the age, or in the bar of a replay.
 const SAID = ["the newest map is ", "the replay is ", "maps are replayed with "];
 const HINT = "Point at a cell, tap it, or use the arrow keys on the map.";
@@ -32,6 +33,7 @@ export class VehicleView {
   #layers;
   #space;
   #plots;
+  #changes;
   #shown = null;
   #is_recorded = false;
   #status = null;
@@ -42,9 +44,10 @@ export class VehicleView {
   #first_drawn_ms = null;
   #drawn_ms = [];
   #history = new History();
+  // The state with which the history was loaded.
+  #loaded_state;
   #trail = new Trail();
   #metrics_at_ms = 0;
-  #sampled_ms = 0;
   #age_timer = 0;
   #is_wanted = false;
 
@@ -54,6 +57,7 @@ export class VehicleView {
     this.#clock = clock;
     this.#settings = settings;
     this.#plots = new Plots($("plots"));
+    this.#changes = new Changes(settings, changed);
     const part = (name) => $("layer-choice").querySelector(`[data-part="${name}"]`);
     const draw = () => {
       changed();
@@ -87,6 +91,8 @@ export class VehicleView {
     this.#space.open(name);
     this.#writeCell(null);
     this.#writeAge();
+    this.#plots.draw(this.#history);
+    this.#changes.write(name, this.#history);
     this.#post({ type: "server", request: { type: "detail", vehicle: name } });
   }
 
@@ -99,6 +105,7 @@ export class VehicleView {
     this.#drawn_ms = [];
     this.#layer_names = [];
     this.#history = new History();
+    this.#loaded_state = undefined;
     this.#trail = new Trail();
     $("refusal").hidden = true;
   }
@@ -110,6 +117,7 @@ export class VehicleView {
     this.#drawn_ms = [];
     this.#space.open(this.name);
     this.#post({ type: "server", request: { type: "detail", vehicle: this.name } });
+    this.#loaded_state = undefined;
   }
 
   // The status of the vehicle; undefined if the server has no such vehicle.
@@ -117,8 +125,13 @@ export class VehicleView {
     const is_missing = status === undefined && this.#layer_names.length === 0;
     if (is_missing) this.refuse(`The server has no vehicle “${this.name}”, or you may not see it.`);
     if (!status) return;
+    // What came before this status, and each change after it.
+    if (status.state !== this.#loaded_state) this.#loadHistory();
+    this.#loaded_state = status.state;
     this.#status = status;
     this.#status_arrived_ms = arrived_ms;
+    this.#history.push(status);
+    this.#plots.draw(this.#history);
     if (this.#layer_names.join() === status.layers.join()) return;
     this.#layer_names = status.layers;
     this.#layers.writeNames(status.layers);
@@ -153,6 +166,15 @@ export class VehicleView {
   // classes: of /classes.json.
   explain(classes) {
     this.#layers.explain(classes);
+  }
+
+  async #loadHistory() {
+    const { name } = this;
+    const answer = await fetch(`history?vehicle=${encodeURIComponent(name)}`).catch(() => null);
+    if (!answer?.ok || this.name !== name) return;
+    this.#history.load(await answer.json());
+    this.#plots.draw(this.#history);
+    this.#changes.write(name, this.#history);
   }
 
   // A key that was pressed anywhere on the page; true if it means something here.
@@ -267,14 +289,6 @@ export class VehicleView {
     for (const element of document.querySelectorAll("[data-status-age]")) {
       metrics.writeStatusAge(element, this.#status_arrived_ms, now_ms);
     }
-    if (now_ms - this.#sampled_ms < SAMPLE_EVERY_MS) return;
-    this.#sampled_ms = now_ms;
-    this.#history.push({
-      at_ms: now_ms, age_ms: this.#is_recorded ? null : (age?.age_ms ?? null), hz: shown ? hz : null,
-      loss: status?.loss ?? null,
-      share: shown?.drivable_share ?? status?.drivable_share ?? null, latency_ms: status?.latency_ms?.total ?? null,
-    });
-    this.#plots.draw(this.#history, now_ms);
   }
 
   // message: { at, sequence, layers } of the Worker; null if no cell is pointed at.

@@ -3,7 +3,7 @@
 
 import assert from "node:assert/strict";
 import test from "node:test";
-import { History, lines, niceTop, SPAN_MS } from "./history.js";
+import { grafanaLink, History, lines, niceTop, SPAN_MS, told } from "./history.js";
 import { saysOf } from "./layers.js";
 import { ahead, egoFrom, fit, moveInto, pan, place, rasterOf, toEgo, toPixel, Trail, zoomAt } from "./view.js";
 
@@ -80,16 +80,45 @@ test("a trail has a point every half metre and begins again after a jump", () =>
   assert.equal(trail.points.length, 2000);
 });
 
+const ROW = { map_age_ms: 50, latency_ms: { total: 8 }, map_rate_hz: 10, loss: null };
+const status = (s, more) => ({ ...ROW, now_ns: `${s}000000000`, ...more });
+
 test("the history keeps ten minutes, and a value that is unknown is a gap and not zero", () => {
   const history = new History();
-  for (let s = 0; s < 700; s++) history.push({ at_ms: 1000 * s, age_ms: s === 650 ? null : 50, loss: null });
-  assert.equal(history.samples.length, 601);
-  assert.ok(history.has("age_ms") && !history.has("loss") && !history.has("hz"));
-  const drawn = lines(history.samples, "age_ms", 699_000, { width: 600, height: 40, top: 100 });
+  for (let s = 1; s <= 700; s++) history.push(status(s, s === 651 ? { map_age_ms: null } : {}));
+  assert.equal(history.rows.length, 601);
+  assert.ok(history.has("map_age_ms") && history.has("latency_ms_total") && !history.has("loss"));
+  const drawn = lines(history.rows, "map_age_ms", 700_000, { width: 600, height: 40, top: 100 });
   assert.deepEqual(drawn.map((line) => line.length), [551, 49]);
   assert.deepEqual([drawn[0][0], drawn[1].at(-1)], [[0, 20], [600, 20]]);
   const pause = [{ at_ms: 0, hz: 1 }, { at_ms: 5000, hz: 1 }];
   assert.equal(lines(pause, "hz", SPAN_MS, { width: 600, height: 40, top: 1 }).length, 2, "no line over a pause");
+});
+
+const CHANGES = [
+  { at_ms: 1_000_000, state: "ok", reason: "", file: "" },
+  { at_ms: 1_060_000, state: "error", reason: "no packets from top for 2.1 s", file: "drive.mcap" },
+];
+
+test("what the server kept comes before the statuses, and none of them is there twice", () => {
+  const history = new History();
+  history.push(status(9));
+  const columns = ["map_age_ms", "map_rate_hz"];
+  history.load({ columns, rows: [[8000, [40, null]], [9000, [50, 9.5]]], changes: CHANGES });
+  [9, 10].forEach((s) => history.push(status(s)));
+  assert.deepEqual(history.rows.map(({ at_ms }) => at_ms), [8000, 9000, 10_000]);
+  assert.deepEqual(history.rows[1], { at_ms: 9000, map_age_ms: 50, map_rate_hz: 9.5 });
+});
+
+test("changes of the state are told newest first, with how long each lasted and its range in Grafana", () => {
+  const [newest, before] = told({ changes: CHANGES });
+  assert.deepEqual([newest.state, newest.lasted_ms, newest.from, newest.to], ["error", null, 940_000, "now"]);
+  assert.deepEqual([before.state, before.lasted_ms, before.from, before.to], ["ok", 60_000, 880_000, 1_180_000]);
+  const link = "https://g.example/grafana/d/clearway/clearway?from=880000&to=1180000&var-vehicle=car+9";
+  for (const of of ["https://g.example/grafana", "https://g.example/grafana/"]) {
+    assert.equal(grafanaLink(of, "car 9", before.from, before.to), link);
+  }
+  for (const none of ["", "g.example", "javascript:alert(1)"]) assert.equal(grafanaLink(none, "car", 0, 1), null);
 });
 
 test("the upper edge of a plot is a round number over all values", () => {

@@ -119,6 +119,7 @@ fn rows() -> Vec<(String, Attempt)> {
         row("page `/readyz`", Attempt::Get(Listener::Page, "/readyz")),
         row("page `/metrics`", Attempt::Get(Listener::Page, "/metrics")),
         row("page `/vehicles`", Attempt::Get(Listener::Page, "/vehicles")),
+        row("page `/history`", Attempt::Get(Listener::Page, "/history?vehicle=car")),
         row("page `/`", Attempt::Get(Listener::Page, "/")),
         row("page `/main.js`", Attempt::Get(Listener::Page, "/main.js")),
         row("page, WebSocket `/live`", Attempt::WebSocket(Listener::Page, "/live")),
@@ -391,9 +392,7 @@ fn table(found: &BTreeMap<String, Vec<bool>>) -> String {
 
 fn read(table: &str) -> BTreeMap<String, Vec<bool>> {
     let lines = table.lines().skip(2).map(|line| line.trim_matches('|').split(" | ").map(str::trim));
-    let cells =
-        lines.map(|mut cells| (cells.next().unwrap_or_default().to_owned(), cells.map(|c| c == "**yes**").collect()));
-    cells.collect()
+    lines.map(|mut row| (row.next().unwrap_or_default().to_owned(), row.map(|c| c == "**yes**").collect())).collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]

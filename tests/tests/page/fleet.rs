@@ -10,9 +10,10 @@ use std::time::Duration;
 use clearway_client::{Client, Observation, now_ns};
 use clearway_daemon::config::Config;
 use clearway_daemon::run::{Running, Server, Setup};
-use clearway_daemon::status::Transport;
+use clearway_daemon::status::{State, Transport};
 use tokio::runtime::Runtime;
 
+use crate::fixture::until;
 use crate::page::webdriver::Browser;
 
 const VEHICLES: usize = 50;
@@ -161,6 +162,42 @@ pub fn a_stopped_vehicle_is_stale() {
     });
 }
 
+pub fn a_tab_opened_late_shows_what_was() {
+    Runtime::new().expect("a runtime").block_on(async {
+        let (names, folder) = (["car".to_owned()], tempfile::tempdir().expect("a folder"));
+        let mut config = config(&names, any());
+        config.recorder.file = folder.path().join("drive.mcap");
+        let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+        let mut states = running.vehicles.0[0].status.states();
+        let driving = Driving::start(&running, &names, Duration::from_millis(100));
+        states.wait_for(|state| *state == State::Ok).await.expect("the server runs");
+        driving.halt();
+        states.wait_for(|state| *state == State::Error).await.expect("the server runs");
+        let browser = Browser::start(1440, 900);
+        browser.open(&format!("http://{}/", running.page.expect("a page")));
+        let told = "return document.getElementById('changes').innerText.split('\\n')";
+        browser.until("the change before the tab", &format!("{told}[0].includes('ERROR since then: ')"));
+        let told = browser.run(told);
+        assert!(told[0].as_str().is_some_and(|text| text.ends_with("drive.mcap")), "{told}");
+        let was_well = |line: &serde_json::Value| line.as_str().is_some_and(|text| text.contains(" OK for "));
+        assert!(told.as_array().is_some_and(|lines| lines.iter().any(was_well)), "{told}");
+        let rates = "return document.querySelector('[data-plot=map_rate_hz]')?.hidden === false";
+        browser.until("the rate of maps before the tab", rates);
+        browser.run("const at = document.getElementById('grafana'); at.value = 'http://g:3000'; at.onchange()");
+        let link = browser.run("return document.querySelector('#changes li a').href");
+        assert!(link.as_str().is_some_and(|link| link.ends_with("&to=now&var-vehicle=car")), "{link}");
+        browser.run("document.getElementById('changes').scrollIntoView()");
+        browser.screenshot("history-1440x900");
+        browser.click(".crumbs a");
+        browser.click("#table");
+        let since = "return /^[0-9]+ s$|min$/.test(document.querySelector('.card [data-part=since]')?.textContent)";
+        browser.until("since when", since);
+        browser.screenshot("table-1440x900");
+        assert_eq!(browser.console_errors(), Vec::<String>::new());
+        running.shutdown().await.expect("it ends well");
+    });
+}
+
 pub fn other_servers_are_shown() {
     Runtime::new().expect("a runtime").block_on(async {
         let other_page = std::net::TcpListener::bind(any()).and_then(|port| port.local_addr()).expect("a free port");
@@ -259,18 +296,25 @@ pub fn fifty_vehicles_are_shown() {
         browser.until("all cards", &format!("return document.querySelectorAll('.card').length === {VEHICLES}"));
         let in_sight = "[...document.querySelectorAll('.card')].filter((card) =>
             card.getBoundingClientRect().top < innerHeight)";
+        // The vehicle is drawn in the middle of its map.
         let all_fresh = format!(
             "const cards = {in_sight};
-            const has = (card) => card.dataset.fresh === 'fresh' && card.querySelector('canvas').width !== 300;
+            const isDrawn = (map) =>
+                map.getContext('2d').getImageData(map.width / 2, map.height / 2, 1, 1).data[3] > 0;
+            const has = (card) => card.dataset.fresh === 'fresh' && isDrawn(card.querySelector('canvas'));
             return cards.length > 8 && cards.every(has)"
         );
         browser.until("fresh maps on the cards in sight", &all_fresh);
         // Only the cards in sight cost the server anything.
-        let readers = running.vehicles.0.iter().map(|of| of.status.transports.count(Transport::Page));
-        let readers: u32 = readers.sum();
-        assert!((8..VEHICLES as u32 - 5).contains(&readers), "maps of {readers} vehicles are sent");
+        let readers =
+            || -> u32 { running.vehicles.0.iter().map(|of| of.status.transports.count(Transport::Page)).sum() };
+        assert!((8..VEHICLES as u32 - 5).contains(&readers()), "maps of {} vehicles are sent", readers());
         browser.until("the vehicles on the map", "return !document.getElementById('where').hidden");
         browser.screenshot("fleet-1440x900");
+        browser.click("#table");
+        until("a table that wants no maps", || readers() == 0).await;
+        browser.screenshot("fleet-table-1440x900");
+        browser.click("#table");
         is_smooth(&browser);
         is_sorted_and_found(&browser);
         // One vehicle, and back.
@@ -302,6 +346,7 @@ fn a_name_with_markup_is_a_text(browser: &Browser) {
             const {{ FleetView }} = await import('/fleet/fleet.js');
             const {{ VehicleView }} = await import('/vehicle/vehicle.js');
             const settings = {{ order: 'name', only: 'all', overlays: [] }};
+            window.fetch = async () => null;
             const clock = {{ now_ns: () => null, ahead_ms: () => null }};
             const status = {{ name: {name}, layers: [{name}], state: 'error', reasons: [{name}] }};
             document.getElementById('cards').replaceChildren();

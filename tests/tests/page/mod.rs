@@ -42,6 +42,7 @@ in_a_browser! {
     a_plan_is_drawn_over_the_map => replayed::a_plan_is_drawn,
     the_time_bar_steps_and_seeks_a_replay => replayed::the_time_bar_controls_a_replay,
     a_map_that_no_longer_comes_is_stale_with_its_true_age => fleet::a_stopped_vehicle_is_stale,
+    a_tab_opened_after_the_fact_shows_what_was => fleet::a_tab_opened_late_shows_what_was,
     vehicles_of_other_servers_are_on_the_page => fleet::other_servers_are_shown,
     the_recorder_is_controlled_from_the_page => fleet::the_recorder_is_controlled,
     the_page_comes_back_after_the_server_does => fleet::the_page_reconnects,

@@ -1,17 +1,18 @@
 //! The HTTP server of the page: its embedded files, what the classes say (`/classes.json`), its WebSocket `/live`
-//! ([`super::page_live`]), `/vehicles`, `/healthz`, `/readyz` and `/metrics`. The last three are also served alone, on
-//! a listener of their own.
+//! ([`super::page_live`]), `/vehicles`, a vehicle's last ten minutes (`/history?vehicle=NAME`), `/healthz`, `/readyz`
+//! and `/metrics`. The last three are also served alone, on a listener of their own.
 
 use std::sync::{Arc, LazyLock};
 use std::time::Instant;
 
 use axum::Router;
 use axum::extract::ws::WebSocketUpgrade;
-use axum::extract::{Extension, State};
+use axum::extract::{Extension, Query, State};
 use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use rust_embed::RustEmbed;
+use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use super::listen::access::Caller;
@@ -90,7 +91,7 @@ pub struct Shown {
 /// Serves the page until `stop` resolves.
 pub async fn serve(listener: Listener, shown: Shown, stop: impl Future<Output = ()>) {
     let router = metrics_routes().route("/live", get(live)).route("/vehicles", get(list));
-    let router = router.route("/classes.json", get(classes)).fallback(asset);
+    let router = router.route("/classes.json", get(classes)).route("/history", get(history)).fallback(asset);
     listener.serve(router.with_state(shown), stop).await;
 }
 
@@ -129,6 +130,26 @@ async fn list(State(shown): State<Shown>, Extension(caller): Extension<Caller>) 
     others.retain(|vehicle| caller.may_reach(&vehicle.name));
     let all = own.chain(others.iter().map(vehicle_json));
     ([(header::CONTENT_TYPE, "application/json")], Value::from(all.collect::<Vec<_>>()).to_string())
+}
+
+/// Whose history is asked for.
+#[derive(Deserialize)]
+struct HistoryOf {
+    vehicle: String,
+}
+
+async fn history(
+    State(shown): State<Shown>,
+    Extension(caller): Extension<Caller>,
+    Query(HistoryOf { vehicle }): Query<HistoryOf>,
+) -> Response {
+    let statuses = shown.vehicles.statuses();
+    match statuses.iter().find(|status| *status.name == *vehicle && caller.may_reach(&vehicle)) {
+        Some(status) => ([(header::CONTENT_TYPE, "application/json")], status.history_json()).into_response(),
+        None => {
+            (StatusCode::NOT_FOUND, format!("no vehicle is named {vehicle:?}, or you may not see it\n")).into_response()
+        }
+    }
 }
 
 async fn health(State(shown): State<Shown>) -> Response {

@@ -11,6 +11,7 @@ use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 
 use super::health::{Facts, SILENT_AFTER, SensorFacts, State};
+use super::history::StateChange;
 use super::json::run_text;
 use super::message::server_name;
 use super::vehicle::{Changing, VehicleStatus, packet_counts};
@@ -28,6 +29,8 @@ const CLAIM_AGE_MAX: Duration = Duration::from_secs(4);
 pub struct Assessment {
     /// The state.
     pub state: State,
+    /// Time for which the state has lasted.
+    pub state_for: Duration,
     /// Why it is not `ok`, worst first.
     pub reasons: Vec<String>,
     /// Age of the newest map; `None` before the first.
@@ -47,8 +50,9 @@ pub async fn watch_states(statuses: Vec<Arc<VehicleStatus>>) {
     loop {
         every.tick().await;
         for status in &statuses {
-            let age_ms = status.assess().map_age_ms;
-            if let Some(age_ms) = age_ms {
+            let assessed = status.assess();
+            status.keep_row(&assessed);
+            if let Some(age_ms) = assessed.map_age_ms {
                 let age = Duration::from_secs_f64(age_ms.max(0.0) / 1e3);
                 locked(&status.changing).counts.ages.observe(age);
             }
@@ -87,12 +91,22 @@ impl VehicleStatus {
 
     /// Assesses the vehicle now.
     pub fn assess(&self) -> Assessment {
-        let mut health = locked(&self.health);
+        let mut watched = locked(&self.health);
+        let (health, history) = &mut *watched;
         let facts = self.facts();
         health.update(&facts);
         let (state, reasons) = (health.state(), health.reasons().to_vec());
+        let state_for = facts.up.saturating_sub(health.since());
         self.health_state.send_if_modified(|last| std::mem::replace(last, state) != state);
-        drop(health);
+        history.push_state(facts.up, state, |state| StateChange {
+            state,
+            reason: reasons.first().cloned().unwrap_or_default(),
+            file: self
+                .recorder
+                .get()
+                .map_or_else(String::new, |counts| counts.to_proto().file.replace(".unfinished.", ".")),
+        });
+        drop(watched);
         let changing = locked(&self.changing);
         let by_clock_ms = now_ns().saturating_sub(changing.counts.newest_capture_end_ns) as f64 / 1e6;
         // The stamp of a recorded map says nothing about now.
@@ -101,12 +115,32 @@ impl VehicleStatus {
             changing.counts.maps > 0 && self.started.elapsed().saturating_sub(changing.mapped_at) <= SILENT_AFTER;
         Assessment {
             state,
+            state_for,
             reasons,
             map_age_ms: (changing.counts.maps > 0).then_some(by_arrival_ms.unwrap_or(by_clock_ms)),
             loss: facts.loss,
             speed_m_s: changing.speed_m_s.filter(|_| is_made),
             claimed_by: facts.claimed_by,
         }
+    }
+
+    /// Adds a row to the history, if a second has begun that has none.
+    fn keep_row(&self, assessed: &Assessment) {
+        let now = self.started.elapsed();
+        if !locked(&self.health).1.is_row_due(now) {
+            return;
+        }
+        let changing = locked(&self.changing);
+        let (window, drivable_share) = (&changing.window, changing.counts.drivable_share);
+        let latency_ms = window.latency_ms(now).get("total").copied();
+        let numbers = [assessed.map_age_ms, latency_ms, Some(window.map_rate_hz(now)), assessed.loss, drivable_share];
+        drop(changing);
+        locked(&self.health).1.push_row(now, numbers);
+    }
+
+    /// The last ten minutes as JSON ([`super::history`]).
+    pub fn history_json(&self) -> String {
+        locked(&self.health).1.to_json(self.started.elapsed(), now_ns() / 1_000_000)
     }
 
     /// Of each sensor, whether its data arrive and are in the newest map.

@@ -46,6 +46,7 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
         "readers": vehicle.readers,
         "fault": (!vehicle.fault.is_empty()).then_some(&vehicle.fault),
         "state": vehicle.state,
+        "state_ms": vehicle.state_ms,
         "reasons": vehicle.reasons,
         "pose": vehicle.pose.map(|pose| {
             // As a string: a double of a browser cannot hold it.

@@ -44,6 +44,7 @@ impl VehicleStatus {
             fault: self.fault().unwrap_or_default(),
             mounts: snapshot.sensors.iter().filter_map(|s| Some((s.name.clone(), mount(&s.mount?)))).collect(),
             state: assessment.state.as_str().to_owned(),
+            state_ms: assessment.state_for.as_secs_f64() * 1e3,
             reasons: assessment.reasons,
             pose,
             speed_m_s: assessment.speed_m_s,

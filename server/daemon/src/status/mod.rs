@@ -7,6 +7,7 @@
 //! | [`window`], [`histogram`] | maps and packet counts -> rates, loss and latency of the last 10 s; buckets of times |
 //! | [`network`] | hung listeners, absent routers, ends of certificates, times of the link -> problems in words |
 //! | [`health`] | what is known at one time -> ok, warn or error, with reasons |
+//! | [`history`] | a row each second and each change of the state -> the last ten minutes |
 //! | [`assess`] | the status of a vehicle -> its state, again and again |
 //! | `message` | a snapshot and a state -> message, JSON |
 //! | `json` | a vehicle's and a sensor's state and counts -> JSON |
@@ -19,6 +20,7 @@
 pub mod assess;
 pub mod health;
 pub mod histogram;
+pub mod history;
 mod json;
 mod message;
 mod metrics;

@@ -60,7 +60,7 @@ pub struct VehicleStatus {
     pub(super) is_from_files: AtomicBool,
     /// Other servers that serve a vehicle of this name: their names and their newest signs of life, by boot id.
     pub(super) claims: Mutex<BTreeMap<u64, (String, Instant)>>,
-    pub(super) health: Mutex<Health>,
+    pub(super) health: Mutex<(Health, super::history::History)>,
     pub(super) health_state: watch::Sender<State>,
     engine_stopped: AtomicBool,
     /// The listeners, the router and the certificates of its server.

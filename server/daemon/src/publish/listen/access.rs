@@ -64,6 +64,7 @@ pub const PATHS: &[(&str, &[Role])] = &[
     ("/readyz", &[]),
     ("/metrics", &[Role::Reader, Role::Ingester]),
     ("/vehicles", &[Role::Reader, Role::Ingester]),
+    ("/history", &[Role::Reader, Role::Ingester]),
     ("/live", &[Role::Reader]),
     (FILES, &[Role::Reader]),
 ];

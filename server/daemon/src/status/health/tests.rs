@@ -108,6 +108,25 @@ fn the_worst_stands_first() {
 }
 
 #[test]
+fn many_silent_sensors_have_one_reason_with_the_longest_time() {
+    let mut facts = fine();
+    facts.sensors.extend(["left", "right"].map(|name| sensor(name, 1)));
+    facts.sensors[1..].iter_mut().zip([5000, 190_000, 9000]).for_each(|(of, age_ms)| of.silent = Some(ms(age_ms)));
+    assert_eq!(words(&facts), [("warn", "3 of 4 sensors silent for 190 s: rear, left, right".to_owned())]);
+    facts.sensors[0].silent = Some(ms(3000));
+    assert_eq!(words(&facts)[0], ("error", "4 of 4 sensors silent for 190 s: top, rear, left, right".to_owned()));
+}
+
+#[test]
+fn many_sensors_that_are_left_out_have_one_reason() {
+    let mut facts = fine();
+    facts.sensors.extend(["left", "right"].map(|name| sensor(name, 1)));
+    facts.sensors[1..].iter_mut().zip(["late", "ahead", "late"]).for_each(|(of, why)| of.left_out = why.to_owned());
+    let text = "3 of 4 sensors left out of the newest map: rear late, left ahead, right late".to_owned();
+    assert_eq!(words(&facts), [("warn", text)]);
+}
+
+#[test]
 fn a_vehicle_without_any_packet_is_an_error_that_says_so() {
     let never = SensorFacts { silent: None, completeness: None, ..sensor("top", 0) };
     let facts = Facts { sensors: vec![never], map_age: None, ..fine() };

@@ -15,6 +15,8 @@ pub const SILENT_AFTER: Duration = Duration::from_secs(2);
 const STALE_ERROR_AFTER: Duration = Duration::from_secs(1);
 /// Time for which a better state must last. Ours: an operator reads one state instead of a flicker.
 const BETTER_AFTER: Duration = Duration::from_secs(3);
+/// Sensors that have a reason each; more of them have one in common. Ours: two lines are read at a glance.
+const APART_MAX: usize = 2;
 /// Share of lost packets above which a vehicle warns, and below which it no longer does. Ours: 1 % is one packet in
 /// each revolution of a VLP-16 of 76 packets.
 const LOSS_WARNS: f64 = 0.01;
@@ -133,6 +135,8 @@ pub struct Finding {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Health {
     state: State,
+    /// Since when the state lasts.
+    since: Duration,
     reasons: Vec<String>,
     /// Since when a better state lasts.
     better_since: Option<Duration>,
@@ -158,6 +162,9 @@ impl Health {
             }
             (self.was_better, self.better_since) = (true, None);
         }
+        if found != before {
+            self.since = facts.up;
+        }
         self.state = found;
         self.reasons = findings.into_iter().map(|finding| finding.text).collect();
         self.state != before
@@ -166,6 +173,11 @@ impl Health {
     /// The state.
     pub fn state(&self) -> State {
         self.state
+    }
+
+    /// Since when the state lasts, as the time since the server started.
+    pub fn since(&self) -> Duration {
+        self.since
     }
 
     /// Why it is not `ok`, worst first.
@@ -183,6 +195,7 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
     }
     silence(facts, &mut add);
     staleness(facts, &mut add);
+    omission(facts, &mut add);
     for sensor in &facts.sensors {
         sensor_findings(sensor, facts.validity, &mut add);
     }
@@ -242,9 +255,15 @@ fn silence(facts: &Facts, add: &mut impl FnMut(State, String)) {
         add(State::Error, format!("no packets{from} since the server started {} ago", seconds(facts.up)));
         return;
     }
-    let is_silent = |sensor: &SensorFacts| sensor.silent.unwrap_or(facts.up) > SILENT_AFTER;
-    let state = if facts.sensors.iter().all(is_silent) { State::Error } else { State::Warn };
-    for sensor in facts.sensors.iter().filter(|sensor| is_silent(sensor)) {
+    let age = |sensor: &SensorFacts| sensor.silent.unwrap_or(facts.up);
+    let silent: Vec<_> = facts.sensors.iter().filter(|sensor| age(sensor) > SILENT_AFTER).collect();
+    let state = if silent.len() == facts.sensors.len() { State::Error } else { State::Warn };
+    if silent.len() > APART_MAX && !silent.iter().any(|sensor| sensor.is_refused) {
+        let longest = seconds(silent.iter().map(|sensor| age(sensor)).max().unwrap_or_default());
+        add(state, in_common(facts, &silent, &format!("silent for {longest}"), |_| ""));
+        return;
+    }
+    for sensor in silent {
         let (name, refused) = (&sensor.name, if sensor.is_refused { "readable " } else { "" });
         add(
             state,
@@ -254,6 +273,30 @@ fn silence(facts: &Facts, add: &mut impl FnMut(State, String)) {
             },
         );
     }
+}
+
+/// Sensors whose scans are not, or not as they should be, in the newest map, although they send.
+fn omission(facts: &Facts, add: &mut impl FnMut(State, String)) {
+    let is_left_out = |sensor: &&SensorFacts| !is_silent(sensor) && !sensor.left_out.is_empty();
+    let left_out: Vec<_> = facts.sensors.iter().filter(is_left_out).collect();
+    if left_out.len() > APART_MAX {
+        add(State::Warn, in_common(facts, &left_out, "left out of the newest map", |sensor| &sensor.left_out));
+        return;
+    }
+    for SensorFacts { name, left_out, .. } in left_out {
+        add(State::Warn, format!("{name} is left out of the newest map: its scan is {left_out}"));
+    }
+}
+
+/// One reason for many sensors, with a remark for each.
+fn in_common(facts: &Facts, of: &[&SensorFacts], what: &str, remark: impl Fn(&SensorFacts) -> &str) -> String {
+    let named = |sensor: &&SensorFacts| format!("{} {}", sensor.name, remark(sensor)).trim_end().to_owned();
+    let names = of.iter().map(named).collect::<Vec<_>>().join(", ");
+    format!("{} of {} sensors {what}: {names}", of.len(), facts.sensors.len())
+}
+
+fn is_silent(sensor: &SensorFacts) -> bool {
+    sensor.silent.is_none_or(|silent| silent > SILENT_AFTER)
 }
 
 fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
@@ -288,7 +331,6 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
 
 fn sensor_findings(sensor: &SensorFacts, validity: Duration, add: &mut impl FnMut(State, String)) {
     let name = &sensor.name;
-    let is_silent = sensor.silent.is_none_or(|silent| silent > SILENT_AFTER);
     if let Some([height_m, pitch_deg, roll_deg]) = sensor.mount {
         let place = if height_m < 0.0 { "lower" } else { "higher" };
         let tilt = if pitch_deg.abs().max(roll_deg.abs()) < 0.5 {
@@ -299,16 +341,13 @@ fn sensor_findings(sensor: &SensorFacts, validity: Duration, add: &mut impl FnMu
         let height = height_m.abs();
         add(State::Warn, format!("{name} is {height:.1} m {place} over the ground than configured{tilt}"));
     }
-    if is_silent {
+    if is_silent(sensor) {
         return;
     }
     sensor.remarks.iter().for_each(|remark| add(State::Warn, format!("{name}: {remark}")));
     if !sensor.senders.is_empty() {
         let senders = sensor.senders.join(", ");
         add(State::Warn, format!("several send the data of {name}, each in place of the others': {senders}"));
-    }
-    if !sensor.left_out.is_empty() {
-        add(State::Warn, format!("{name} is left out of the newest map: its scan is {}", sensor.left_out));
     }
     if let Some(completeness) = sensor.completeness.filter(|share| *share < COMPLETENESS_MIN) {
         add(State::Warn, format!("{name} covers {:.0} % of its revolution", 100.0 * completeness));
