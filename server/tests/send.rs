@@ -1,6 +1,7 @@
 //! `clearway send` sends a capture that the test writes to sockets of the test.
 
 use std::net::UdpSocket;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use serde_json::Value;
@@ -72,6 +73,34 @@ fn data_and_telemetry_are_sent_unchanged_and_other_datagrams_are_counted() {
     assert_eq!((&document["packets"], &document["telemetry"]), (&1.into(), &1.into()));
     assert_eq!(document["skipped"]["100 bytes; 1206 and 512 are sent"], 1);
     assert!(document["cut"].as_str().unwrap().contains("cut off"), "the last packet lacks a byte: {document}");
+}
+
+#[test]
+fn a_capture_in_a_loop_begins_again_at_its_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("drive.pcap");
+    std::fs::write(&file, pcap(&[vec![1; 1206], vec![2; 1206]])).unwrap();
+    let data = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let to = format!("udp://{}", data.local_addr().unwrap());
+    let mut command = Command::new(env!("CARGO_BIN_EXE_clearway"));
+    let mut sender =
+        command.args(["send", file.to_str().unwrap(), "--to", &to, "--loop"]).stdout(Stdio::null()).spawn().unwrap();
+    let mut buffer = [0; 1206];
+    let first_bytes = [(); 6].map(|()| (data.recv(&mut buffer).unwrap(), buffer[0]).1);
+    sender.kill().unwrap();
+    sender.wait().unwrap();
+    assert_eq!(first_bytes, [1, 2, 1, 2, 1, 2]);
+}
+
+#[test]
+fn datagrams_to_a_closed_port_are_counted_and_the_command_fails() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("drive.pcap");
+    std::fs::write(&file, pcap(&vec![vec![1; 1206]; 20])).unwrap();
+    let closed = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let done = clearway(&["send", file.to_str().unwrap(), "--to", &format!("udp://{closed}")]);
+    assert_eq!(done.status.code(), Some(2));
+    assert!(text(&done.stderr).contains(&format!("no socket is open at {closed}")), "{}", text(&done.stderr));
 }
 
 #[test]

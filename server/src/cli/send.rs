@@ -21,6 +21,7 @@ use super::tool_commands::progress_bar;
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway send drive.pcap --to udp://127.0.0.1:2368
+  clearway send drive.pcap --to udp://127.0.0.1:2368 --loop
   clearway send drive.pcap --to udp://127.0.0.1:2368 --bind 127.0.0.2 --speed max
   clearway send drive.pcap --to udp://127.0.0.1:2368 --network loss=5,reorder=8,seed=7")]
 pub struct SendArguments {
@@ -38,6 +39,9 @@ pub struct SendArguments {
     /// Speed, as a multiple of the recorded one, such as 0.5; or max for as fast as possible.
     #[arg(long, default_value = "1", value_name = "X|max", value_parser = pace)]
     speed: Pace,
+    /// Send the capture again and again, until Ctrl-C.
+    #[arg(long = "loop")]
+    repeats: bool,
     /// Simulate a bad network. In percent of the datagrams: loss, duplicate, truncate (cut short), flip (a bit). In
     /// data packets: burst (most that are lost in a row; about one packet in 200 begins a burst), reorder (most that
     /// overtake a late one; one in four is late). Also delay_ms (longest delay) and seed (the same seed makes the same
@@ -79,12 +83,12 @@ pub fn target(text: &str) -> Result<SocketAddr> {
 /// # Errors
 /// As [`send`].
 pub fn run(arguments: SendArguments) -> Result<Exit> {
-    let SendArguments { file, to, telemetry_to, bind, speed: pace, network: faults, json } = arguments;
+    let SendArguments { file, to, telemetry_to, bind, speed: pace, repeats, network: faults, json } = arguments;
     let to = target(&to)?;
     let telemetry_to = telemetry_to.as_deref().map_or(Ok(to), target)?;
     let any: IpAddr = if to.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() };
     let bar = progress_bar(files::open(&file)?.1);
-    let options = SendOptions { file, to, telemetry_to, own: bind.unwrap_or((any, 0).into()), pace, faults };
+    let options = SendOptions { file, to, telemetry_to, own: bind.unwrap_or((any, 0).into()), pace, repeats, faults };
     let summary = send(&options, |bytes| bar.set_position(bytes))?;
     bar.finish_and_clear();
     print_line(&if json { document(&summary) } else { text(&summary, &options) })?;

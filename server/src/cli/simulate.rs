@@ -27,7 +27,7 @@ fn names() -> PossibleValuesParser {
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway simulate town --seconds 10 --out drive.pcap
-  clearway simulate street --sensor vlp16 --to udp://127.0.0.1:2368")]
+  clearway simulate street --sensor vlp16 --to udp://127.0.0.1:2368 --endless")]
 pub struct SimulateArguments {
     /// The scene.
     #[arg(value_parser = names())]
@@ -39,6 +39,9 @@ pub struct SimulateArguments {
     /// Duration of the drive, in seconds.
     #[arg(long, default_value = "10", value_parser = seconds)]
     seconds: Duration,
+    /// With --to: drive on until Ctrl-C.
+    #[arg(long, requires = "to", conflicts_with_all = ["seconds", "out"])]
+    endless: bool,
     /// Seed of the sensor's noise; the same seed makes the same datagrams.
     #[arg(long, default_value = "1")]
     seed: u64,
@@ -63,7 +66,7 @@ fn seconds(text: &str) -> Result<Duration, String> {
 /// # Errors
 /// If the file exists or cannot be written, or the datagrams cannot be sent.
 pub fn run(arguments: &SimulateArguments) -> Result<()> {
-    let SimulateArguments { scene, sensor, seconds, seed, out, to, telemetry_to } = arguments;
+    let SimulateArguments { scene, sensor, seconds, endless, seed, out, to, telemetry_to } = arguments;
     let named = scenes::find(scene).expect("clap accepts only names of scenes");
     let drive = SimulatedDrive { scene: (named.make)(), model: *sensor, duration: *seconds, seed: *seed };
     let (sent, place) = match (out, to) {
@@ -75,7 +78,8 @@ pub fn run(arguments: &SimulateArguments) -> Result<()> {
         }
         (None, Some(to)) => {
             let to = target(to)?;
-            (drive.send(to, telemetry_to.as_deref().map_or(Ok(to), target)?)?, format!("sent to {to}"))
+            let telemetry_to = telemetry_to.as_deref().map_or(Ok(to), target)?;
+            (drive.send(to, telemetry_to, *endless)?, format!("sent to {to}"))
         }
         (None, None) => unreachable!("clap requires --out or --to"),
     };

@@ -39,6 +39,8 @@ pub struct SendOptions {
     pub own: SocketAddr,
     /// Speed.
     pub pace: Pace,
+    /// True: the file is sent again and again.
+    pub repeats: bool,
     /// Faults of the network; `None`: a good one.
     pub faults: Option<Faults>,
 }
@@ -66,7 +68,7 @@ pub struct SendSummary {
 /// If the file cannot be read or has no Velodyne datagram, or a datagram cannot be sent. A file that is cut off is not
 /// an error: the summary says so.
 pub fn send(options: &SendOptions, progress: impl FnMut(u64)) -> Result<SendSummary> {
-    let mut datagrams = RecordedDatagrams::open(&options.file, progress)?;
+    let mut datagrams = RecordedDatagrams::open(&options.file, options.repeats, progress)?;
     let mut network = options.faults.map(Impairment::new);
     let began = Instant::now();
     let send = |arriving: &mut dyn Iterator<Item = Datagram>| {
@@ -92,6 +94,8 @@ pub fn send(options: &SendOptions, progress: impl FnMut(u64)) -> Result<SendSumm
 /// The datagrams of a file, with gaps of at most [`GAP_NS_MAX`]. They end at the first error.
 struct RecordedDatagrams<P> {
     source: DatagramSource,
+    /// The file, if it begins again at its end.
+    again: Option<PathBuf>,
     progress: P,
     /// Datagrams that are read and not returned yet.
     read: VecDeque<Datagram>,
@@ -100,9 +104,10 @@ struct RecordedDatagrams<P> {
     notes: Vec<String>,
     cut: Option<String>,
     error: Option<Error>,
-    /// Stamp of the newest datagram as recorded, and the sum of the gaps that were left out, in nanoseconds.
+    /// Stamp of the newest datagram as recorded, in nanoseconds; `None` at the beginning of the file.
     newest_ns: Option<i64>,
-    left_out_ns: i64,
+    /// Its stamp without the gaps that are left out; `None` before the first.
+    sent_ns: Option<i64>,
 }
 
 enum DatagramSource {
@@ -110,18 +115,24 @@ enum DatagramSource {
     Mcap(Box<McapReader>),
 }
 
-impl<P: FnMut(u64)> RecordedDatagrams<P> {
-    fn open(file: &Path, progress: P) -> Result<Self> {
+impl DatagramSource {
+    fn open(file: &Path) -> Result<Self> {
         let (open, _) = files::open(file)?;
-        let source = match kind(file)? {
-            FileKind::Mcap => DatagramSource::Mcap(Box::new(McapReader::open(file)?)),
+        Ok(match kind(file)? {
+            FileKind::Mcap => Self::Mcap(Box::new(McapReader::open(file)?)),
             _ => {
                 let capture = Capture::new(BufReader::<File>::new(open));
-                DatagramSource::Capture(Box::new(capture.with_context(|| file.display().to_string())?))
+                Self::Capture(Box::new(capture.with_context(|| file.display().to_string())?))
             }
-        };
+        })
+    }
+}
+
+impl<P: FnMut(u64)> RecordedDatagrams<P> {
+    fn open(file: &Path, repeats: bool, progress: P) -> Result<Self> {
         Ok(Self {
-            source,
+            source: DatagramSource::open(file)?,
+            again: repeats.then(|| file.to_owned()),
             progress,
             read: VecDeque::new(),
             skipped: BTreeMap::new(),
@@ -130,12 +141,23 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
             cut: None,
             error: None,
             newest_ns: None,
-            left_out_ns: 0,
+            sent_ns: None,
         })
     }
 
-    /// Reads the next datagram of the capture, or the next message; `false` at the end.
+    /// Reads the next datagram, from the beginning of the file again if that is wanted; `false` at the end, and in a
+    /// file without any.
     fn read_on(&mut self) -> Result<bool> {
+        if self.read_once()? {
+            return Ok(true);
+        }
+        let Some(file) = self.again.as_ref().filter(|_| self.newest_ns.is_some()) else { return Ok(false) };
+        (self.source, self.newest_ns) = (DatagramSource::open(file)?, None);
+        Ok(true)
+    }
+
+    /// Reads the next datagram of the capture, or the next message; `false` at the end.
+    fn read_once(&mut self) -> Result<bool> {
         match &mut self.source {
             DatagramSource::Capture(capture) => {
                 let Some(datagram) = capture.next() else {
@@ -186,8 +208,9 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
             }
         };
         let gap_ns = stamp_ns.saturating_sub(self.newest_ns.replace(stamp_ns).unwrap_or(stamp_ns));
-        self.left_out_ns += if gap_ns > GAP_NS_MAX { gap_ns } else { 0 };
-        self.read.push_back(Datagram { stamp_ns: stamp_ns - self.left_out_ns, kind, payload: payload.to_vec() });
+        let gap_ns = if gap_ns > GAP_NS_MAX { 0 } else { gap_ns };
+        let stamp_ns = *self.sent_ns.insert(self.sent_ns.map_or(stamp_ns, |sent_ns| sent_ns + gap_ns));
+        self.read.push_back(Datagram { stamp_ns, kind, payload: payload.to_vec() });
     }
 
     fn skip(&mut self, reason: &str, count: u64) {

@@ -91,14 +91,13 @@ impl VehicleStatus {
 
     /// Assesses the vehicle now.
     pub fn assess(&self) -> Assessment {
-        let mut watched = locked(&self.health);
-        let (health, history) = &mut *watched;
+        let mut health = locked(&self.health);
         let facts = self.facts();
         health.update(&facts);
         let (state, reasons) = (health.state(), health.reasons().to_vec());
         let state_for = facts.up.saturating_sub(health.since());
         self.health_state.send_if_modified(|last| std::mem::replace(last, state) != state);
-        history.push_state(facts.up, state, |state| StateChange {
+        locked(&self.history).push_state(facts.up, state, |state| StateChange {
             state,
             reason: reasons.first().cloned().unwrap_or_default(),
             file: self
@@ -106,7 +105,7 @@ impl VehicleStatus {
                 .get()
                 .map_or_else(String::new, |counts| counts.to_proto().file.replace(".unfinished.", ".")),
         });
-        drop(watched);
+        drop(health);
         let changing = locked(&self.changing);
         let by_clock_ms = now_ns().saturating_sub(changing.counts.newest_capture_end_ns) as f64 / 1e6;
         // The stamp of a recorded map says nothing about now.
@@ -127,7 +126,7 @@ impl VehicleStatus {
     /// Adds a row to the history, if a second has begun that has none.
     fn keep_row(&self, assessed: &Assessment) {
         let now = self.started.elapsed();
-        if !locked(&self.health).1.is_row_due(now) {
+        if !locked(&self.history).is_row_due(now) {
             return;
         }
         let changing = locked(&self.changing);
@@ -135,12 +134,12 @@ impl VehicleStatus {
         let latency_ms = window.latency_ms(now).get("total").copied();
         let numbers = [assessed.map_age_ms, latency_ms, Some(window.map_rate_hz(now)), assessed.loss, drivable_share];
         drop(changing);
-        locked(&self.health).1.push_row(now, numbers);
+        locked(&self.history).push_row(now, numbers);
     }
 
     /// The last ten minutes as JSON ([`super::history`]).
     pub fn history_json(&self) -> String {
-        locked(&self.health).1.to_json(self.started.elapsed(), now_ns() / 1_000_000)
+        locked(&self.history).to_json(self.started.elapsed(), now_ns() / 1_000_000)
     }
 
     /// Of each sensor, whether its data arrive and are in the newest map.

@@ -24,6 +24,7 @@ use clearway_journal::encode::EncodedMap;
 
 use super::health::{Health, State};
 use super::histogram::Histogram;
+use super::history::History;
 use super::network::Network;
 use super::notices::Notices;
 use super::transports::{Readers, Transport};
@@ -60,7 +61,8 @@ pub struct VehicleStatus {
     pub(super) is_from_files: AtomicBool,
     /// Other servers that serve a vehicle of this name: their names and their newest signs of life, by boot id.
     pub(super) claims: Mutex<BTreeMap<u64, (String, Instant)>>,
-    pub(super) health: Mutex<(Health, super::history::History)>,
+    pub(super) health: Mutex<Health>,
+    pub(super) history: Mutex<History>,
     pub(super) health_state: watch::Sender<State>,
     engine_stopped: AtomicBool,
     /// The listeners, the router and the certificates of its server.
@@ -200,6 +202,7 @@ impl VehicleStatus {
             is_from_files: AtomicBool::new(false),
             claims: Mutex::default(),
             health: Mutex::default(),
+            history: Mutex::default(),
             health_state: watch::Sender::new(State::default()),
             engine_stopped: AtomicBool::new(false),
             network: Network::default(),
