@@ -3,8 +3,8 @@
 //! The picture rotates with the vehicle: up is ahead, not north. It shows the classes in the colours of the layer's
 //! legend, or one channel: ids in one colour each, other values from dark to light. Safe points of the layer are drawn
 //! as lines between linked points, and circles with their radii; over them the path of a plan, its footprint at the
-//! end, and its goal. Under the map stand the stamp, what the colours mean and a scale bar; the PNG's text `Comment` has
-//! the channel, its least and greatest value and its unit. The picture of a stale map has a red frame and the word
+//! end, and its goal. Under the map stand the stamp, what the colours mean and a scale bar; the PNG's text `Comment`
+//! has the channel, its least and greatest value and its unit. The picture of a stale map has a red frame and the word
 //! STALE.
 //!
 //! | file | in -> out |
