@@ -31,7 +31,8 @@ fn help_lists_the_subcommands_in_order_and_the_exit_codes() {
 #[test]
 fn every_subcommand_has_help() {
     let help = text(&clearway(&["--help"]).stdout);
-    let names = help.lines().filter_map(|line| line.strip_prefix("  ")?.split_once(' ').map(|(name, _)| name));
+    let lines = help.lines().take_while(|line| *line != "Pages:");
+    let names = lines.filter_map(|line| line.strip_prefix("  ")?.split_once(' ').map(|(name, _)| name));
     let names: Vec<&str> =
         names.filter(|name| !matches!(name.chars().next(), None | Some('-')) && *name != "help").collect();
     assert_eq!(names.len(), 24, "{names:?}");
