@@ -71,7 +71,12 @@ pub use zenoh::ZenohClient;
 #[doc = include_str!("../../README.md")]
 struct Readme;
 
-/// Compiles the code blocks of the planners' guide.
+/// Compiles the code blocks of the page on plans.
 #[cfg(doctest)]
-#[doc = include_str!("../README.md")]
-struct Guide;
+#[doc = include_str!("../guide/plans.md")]
+struct PlansPage;
+
+/// Compiles the code blocks of the page on observations.
+#[cfg(doctest)]
+#[doc = include_str!("../guide/sending.md")]
+struct SendingPage;

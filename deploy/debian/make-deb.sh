@@ -36,12 +36,12 @@ install -D -m 644 deploy/systemd/clearway.sysctl "$package/usr/lib/sysctl.d/60-c
 "$binary" completions bash | install -D -m 644 /dev/stdin "$package/usr/share/bash-completion/completions/clearway"
 "$binary" completions zsh | install -D -m 644 /dev/stdin "$package/usr/share/zsh/vendor-completions/_clearway"
 doc=$package/usr/share/doc/clearway
-install -D -m 644 deploy/README.md "$doc/README.md"
-install -D -m 644 deploy/debian/copyright "$doc/copyright"
-install -D -m 755 deploy/make-test-ca.sh "$doc/make-test-ca.sh"
-for settings in deploy/zenoh/*.json5; do
-    install -D -m 644 "$settings" "$doc/zenoh/${settings##*/}"
+# The pages and what they name, beside each other as in the sources.
+for file in README.md ./*/README.md ./*/guide/*.md client/ros2/README.md deploy/zenoh/*.json5; do
+    install -D -m 644 "$file" "$doc/$file"
 done
+install -D -m 644 deploy/debian/copyright "$doc/copyright"
+install -D -m 755 deploy/make-test-ca.sh "$doc/deploy/make-test-ca.sh"
 {
     printf 'clearway (%s) stable; urgency=medium\n\n  * See CHANGELOG.md of the sources.\n\n' "$version"
     printf ' -- The Clearway developers <clearway@localhost>  %s\n' "$(date -u -R -d "@$SOURCE_DATE_EPOCH")"

@@ -22,12 +22,17 @@ fn help_lists_the_subcommands_in_order_and_the_exit_codes() {
     let order = ["Commands:", "  serve ", "  replay ", "  verify ", "  watch ", "Options:", "Exit codes:"];
     assert!(order.map(position).is_sorted(), "{help}");
     position("Exit codes: 0 good, 1 the result differs, 2 an input cannot be read");
+    let pages: Vec<_> = help.split_whitespace().filter(|word| word.ends_with(".md")).collect();
+    assert!(pages.len() >= 8, "{pages:?}");
+    let repository = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    assert!(pages.iter().all(|page| repository.join(page).is_file()), "{pages:?}");
 }
 
 #[test]
 fn every_subcommand_has_help() {
     let help = text(&clearway(&["--help"]).stdout);
-    let names = help.lines().filter_map(|line| line.strip_prefix("  ")?.split_once(' ').map(|(name, _)| name));
+    let lines = help.lines().take_while(|line| *line != "Pages:");
+    let names = lines.filter_map(|line| line.strip_prefix("  ")?.split_once(' ').map(|(name, _)| name));
     let names: Vec<&str> =
         names.filter(|name| !matches!(name.chars().next(), None | Some('-')) && *name != "help").collect();
     assert_eq!(names.len(), 24, "{names:?}");

@@ -271,7 +271,7 @@ mod tests {
 
     #[test]
     fn the_routers_of_deploy_have_the_environment_of_those_that_are_measured() {
-        for file in ["container/compose.yaml", "kubernetes/router.yaml", "README.md"] {
+        for file in ["container/compose.yaml", "kubernetes/router.yaml", "guide/fleet.md"] {
             let text = std::fs::read_to_string(crate::workspace().join("deploy").join(file)).expect("it is there");
             assert!(text.contains(ROUTER_ENVIRONMENT.0) && text.contains(ROUTER_ENVIRONMENT.1), "{file}");
         }

@@ -106,7 +106,7 @@ async fn get(options: &GetArguments, format: Option<Format>) -> Result<Exit> {
     };
     let (age_ms, stale) = (map.age_ms(now_ns()), map.is_stale(now_ns()));
     let bytes = match format {
-        Format::Png => picture::png(layer, &PictureStyle { stale, ..drawing.style() })?,
+        Format::Png => picture::png(map.header(), layer, &PictureStyle { stale, ..drawing.style() })?,
         Format::Npy => {
             let channel = layer.channel("class").or(layer.channels.first()).context("the layer has no channel")?;
             npy::encode(&channel.cells, layer.grid.shape())

@@ -90,11 +90,24 @@ enum ClearwayCommand {
     Completions(completions::CompletionsArguments),
 }
 
+/// The pages by subject, from the repository or the package's folder of documents on.
+const PAGES: &str = "Pages:
+  a planner                 client/README.md
+  drives, replay and tests  server/README.md
+  recordings, black box     server/guide/recordings.md
+  a first sensor            deploy/guide/first-sensor.md
+  sensors and time          deploy/guide/sensors-and-time.md
+  configuration             deploy/guide/configuration.md
+  operations                deploy/guide/operations.md
+  ROS 2                     client/ros2/README.md
+A package of Debian has them in /usr/share/doc/clearway.";
+
 /// What the help text says after the options.
 fn after_help() -> String {
     let without = "This build is without the feature `tools`: `demo`, `evaluate`, `init`, `get`, `export`, `send` and \
         `simulate` are not in it.";
-    if cfg!(feature = "tools") { EXIT_CODES.to_owned() } else { format!("{EXIT_CODES}\n\n{without}") }
+    let help = format!("{PAGES}\n\n{EXIT_CODES}");
+    if cfg!(feature = "tools") { help } else { format!("{help}\n\n{without}") }
 }
 
 /// Runs the command line of this process.

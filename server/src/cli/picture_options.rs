@@ -10,7 +10,7 @@ pub struct PictureOptions {
     /// Edge of the map in a picture, in pixels; 800 if absent.
     #[arg(long, value_parser = clap::value_parser!(u32).range(16..=8192))]
     pixels: Option<u32>,
-    /// Distance from the vehicle to the edge of the map, in metres; the whole grid if absent.
+    /// Distance from the vehicle to the edge of the map, in metres; 30 if absent.
     #[arg(long, value_name = "METRES", value_parser = metres)]
     range: Option<f64>,
     /// Draw this channel, such as roughness, of the layers that have it; the classes if absent. The colours have the
@@ -23,8 +23,8 @@ impl PictureOptions {
     /// The style of these options.
     pub fn style(&self) -> PictureStyle {
         let default = PictureStyle::default();
-        let pixels = self.pixels.unwrap_or(default.pixels);
-        PictureStyle { pixels, range_m: self.range, channel: self.channel.clone(), ..default }
+        let (pixels, range_m) = (self.pixels.unwrap_or(default.pixels), self.range.unwrap_or(default.range_m));
+        PictureStyle { pixels, range_m, channel: self.channel.clone(), ..default }
     }
 
     /// The first of these options that is given.

@@ -1,6 +1,5 @@
 //! Who may do what, on every listener: each call and key against each kind of client. The table stands in
-//! deploy/ACCESS.md,
-//! and this test holds it equal to what a server with certificates and roles does.
+//! deploy/guide/access.md, and this test holds it equal to what a server with certificates and roles does.
 //!
 //! A new row is one line in [`rows`]. `CLEARWAY_BLESS=1 cargo test --test system access` writes the table.
 
@@ -27,7 +26,7 @@ use zenoh::sample::{Locality, Sample, SampleKind, SourceInfo};
 use crate::fixture::certificates::{TOKEN, certificates, start, with_roles, zenoh_file};
 use crate::fixture::{Driving, https, until, within};
 
-const TABLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/ACCESS.md");
+const TABLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/guide/access.md");
 const BEGIN: &str = "<!-- The table is written by tests/tests/listeners/access.rs. -->\n";
 const END: &str = "<!-- End of the table. -->";
 
@@ -381,23 +380,24 @@ fn is_blessed() -> bool {
 }
 
 fn table(found: &BTreeMap<String, Vec<bool>>) -> String {
-    let names = CALLERS.map(|caller| caller.name).join(" | ");
-    let mut table = format!("| what | {names} |\n|---|{}\n", "---|".repeat(CALLERS.len()));
+    let mut table = "| what | who |\n|---|---|\n".to_owned();
     for (row, _) in rows() {
-        let cells: Vec<_> = found[&row].iter().map(|may| if *may { "**yes**" } else { "no" }).collect();
-        table += &format!("| {row} | {} |\n", cells.join(" | "));
+        let who = CALLERS.iter().zip(&found[&row]).filter(|(_, may)| **may).map(|(caller, _)| caller.name);
+        let who = who.collect::<Vec<_>>().join(", ");
+        table += &format!("| {row} | {} |\n", if who.is_empty() { "none" } else { &who });
     }
     table
 }
 
 fn read(table: &str) -> BTreeMap<String, Vec<bool>> {
-    let lines = table.lines().skip(2).map(|line| line.trim_matches('|').split(" | ").map(str::trim));
-    lines.map(|mut row| (row.next().unwrap_or_default().to_owned(), row.map(|c| c == "**yes**").collect())).collect()
+    let rows = table.lines().skip(2).filter_map(|line| line.trim_matches('|').split_once(" | "));
+    let may = |who: &str| CALLERS.iter().map(|caller| who.split(", ").any(|name| name == caller.name)).collect();
+    rows.map(|(row, who)| (row.trim().to_owned(), may(who.trim()))).collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn the_access_table_of_security_md_is_what_the_server_does() {
+async fn the_access_table_is_what_the_server_does() {
     let text = std::fs::read_to_string(TABLE).unwrap();
     let (before, rest) = text.split_once(BEGIN).expect("the mark before the table");
     let (golden, after) = rest.split_once(END).expect("the mark after the table");
@@ -417,6 +417,6 @@ async fn the_access_table_of_security_md_is_what_the_server_does() {
     if is_blessed() {
         std::fs::write(TABLE, format!("{before}{BEGIN}{measured}{END}{after}")).unwrap();
     } else {
-        assert_eq!(golden, measured, "CLEARWAY_BLESS=1 writes the measured table into deploy/ACCESS.md");
+        assert_eq!(golden, measured, "CLEARWAY_BLESS=1 writes the measured table into deploy/guide/access.md");
     }
 }

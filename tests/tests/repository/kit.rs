@@ -1,4 +1,4 @@
-//! The tests of a planner that client/README.md shows, in Rust, Python and a shell, as they are written there.
+//! The tests of a planner that client/guide/testing.md shows, in Rust, Python and a shell, as they are written there.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +9,7 @@ use clearway_client::zenoh::ZenohClient;
 use clearway_client::{ClientError, Footprint, StreamEvent, Subscription, now_ns, v1};
 use clearway_tests::{binaries, run, workspace};
 
-use crate::fixture::venv;
+use crate::fixture::{pages, venv};
 
 #[tokio::test]
 async fn the_street_ahead_is_free() -> Result<(), Box<dyn std::error::Error>> {
@@ -88,27 +88,18 @@ async fn a_reader_over_zenoh_learns_that_a_replay_has_ended_and_why_one_in_locks
     assert!(failed.contains("map 0 of vehicle car was not acknowledged within 0.5 s"), "{failed}");
 }
 
-/// The code blocks of a language in the section of client/README.md on tests of a planner.
+/// The code blocks of a language.
 fn blocks(language: &str) -> Vec<String> {
-    blocks_of("client/README.md", "## Testing your planner on a recording", language)
-}
-
-/// The code blocks of a language in a section of a page.
-fn blocks_of(page: &str, title: &str, language: &str) -> Vec<String> {
-    let page = fs::read_to_string(workspace().join(page)).expect("the page");
-    let (_, section) = page.split_once(title).expect("the section");
-    let section = section.split("\n## ").next().expect("its text");
-    let start = format!("```{language}\n");
-    section.split(&start).skip(1).filter_map(|rest| rest.split("```").next()).map(str::to_owned).collect()
+    pages::blocks_of("client/guide/testing.md", language)
 }
 
 #[test]
-fn the_test_in_rust_is_the_one_of_the_readme() {
+fn the_test_in_rust_is_the_one_of_the_page() {
     let shown = blocks("rust,ignore");
     assert_eq!(shown.len(), 1);
     let own = include_str!("kit.rs").replace("    binaries();\n", "");
     let body = shown[0].split_once("#[tokio::test]").expect("a test").1;
-    assert!(own.contains(body), "the README shows another test:\n{body}");
+    assert!(own.contains(body), "the page shows another test:\n{body}");
 }
 
 #[test]
@@ -155,7 +146,7 @@ fn the_shell_steps_end_with_success_and_fail_for_a_recording_that_is_not_there()
 }
 
 #[test]
-fn the_verify_commands_end_with_the_exit_codes_that_the_readme_gives() {
+fn the_verify_commands_end_with_the_exit_codes_that_the_page_gives() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     fs::create_dir(at("drives")).unwrap();
@@ -164,8 +155,8 @@ fn the_verify_commands_end_with_the_exit_codes_that_the_readme_gives() {
     }
     let config = fs::read_to_string(workspace().join("deploy/clearway.toml")).unwrap();
     fs::write(at("new.toml"), config.replace("vehicle_width_m = 2.0", "vehicle_width_m = 2.6")).unwrap();
-    let shown = blocks_of("server/README.md", "## Verify recordings", "shell");
-    let codes = shown[0].lines().map(|command| {
+    let shown = pages::commands_of("server/guide/replay.md", &["shell"]);
+    let codes = shown.iter().map(|command| {
         let words: Vec<_> = command.split_whitespace().collect();
         run(folder.path(), words[0], &words[1..]).status.code()
     });

@@ -3,6 +3,7 @@
 mod kit;
 mod modules;
 mod packages;
+mod pages;
 mod ratchet;
 mod readme;
 mod tidy;

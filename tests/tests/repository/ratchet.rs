@@ -17,6 +17,8 @@ use super::{entries, files, folders, shown, sources};
 const LINES_MAX: usize = 400;
 /// Most entries of a folder: what a reader takes in at one look.
 const ENTRIES_MAX: usize = 12;
+/// Most words of a page without a line in the list: what a reader reads at once.
+const WORDS_MAX: usize = 700;
 /// Most declarations of a type name: a name that greps has one.
 const DECLARATIONS_MAX: usize = 2;
 
@@ -125,7 +127,14 @@ fn declared_type(line: &str) -> Option<&str> {
     (!name.is_empty()).then_some(name)
 }
 
-/// Long options, configuration keys, and words of the documents.
+/// Pages with more than [`WORDS_MAX`] words.
+fn long_pages() -> Values {
+    let words = |file: &Path| fs::read_to_string(file).expect("UTF-8").split_whitespace().count();
+    let all = files(&workspace(), &["md"]);
+    all.iter().map(|file| (shown(file), words(file))).filter(|(_, words)| *words > WORDS_MAX).collect()
+}
+
+/// Long options and configuration keys.
 fn counts() -> Values {
     let completions = clearway_tests::run(&workspace(), "clearway", &["completions", "fish"]);
     let completions = String::from_utf8(completions.stdout).expect("UTF-8");
@@ -135,14 +144,10 @@ fn counts() -> Values {
         let line = line.trim_start_matches(['#', ' ']);
         line.split_once(" = ").is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_'))
     };
-    let mut counts = Values::from([
+    Values::from([
         ("long options of all subcommands".to_owned(), options.count()),
         ("keys of deploy/clearway.toml".to_owned(), read("deploy/clearway.toml").lines().filter(is_key).count()),
-    ]);
-    for file in files(&workspace(), &["md"]) {
-        counts.insert(format!("words of {}", shown(&file)), read(&shown(&file)).split_whitespace().count());
-    }
-    counts
+    ])
 }
 
 /// Compares a section with today's values; an entry that is not in the file may not be there at all, unless it is one
@@ -218,6 +223,11 @@ fn a_type_name_is_declared_at_most_twice_but_for_a_list_that_shrinks() {
 }
 
 #[test]
-fn options_keys_and_words_of_the_documents_only_become_less() {
+fn no_page_has_more_than_700_words_but_for_a_list_that_shrinks() {
+    only_shrinks("words of pages over 700", "make a page of each subject", &long_pages());
+}
+
+#[test]
+fn options_and_keys_only_become_less() {
     only_shrinks("counts", "raise it by hand, with the reason behind a #", &counts());
 }

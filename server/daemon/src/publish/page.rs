@@ -49,7 +49,7 @@ const LAYERS: [(&str, &str); 7] = [
     ("freespace", include_str!("../../../core/mapping/src/layer/freespace/README.md")),
 ];
 /// The document with a table of the meanings.
-const MEANINGS: &str = include_str!("../../../../client/README.md");
+const MEANINGS: &str = include_str!("../../../../client/guide/planner.md");
 
 /// JSON: `layers`, what each class of each layer says, and `meanings`, what a planner may do by each meaning.
 static CLASSES: LazyLock<String> = LazyLock::new(|| {

@@ -206,7 +206,7 @@ fn draw(map: &EncodedMap, file: &Path) -> Result<()> {
     let map = decode_map(map.select(&["freespace".into()]), &Limits::default())?;
     let Some(layer) = map.layer("freespace") else { return Ok(()) };
     let unfinished = file.with_extension("png.part");
-    std::fs::write(&unfinished, picture::png(layer, &PictureStyle { pixels: 640, ..PictureStyle::default() })?)?;
+    std::fs::write(&unfinished, picture::png(&map.header, layer, &PictureStyle::default())?)?;
     Ok(std::fs::rename(&unfinished, file)?)
 }
 

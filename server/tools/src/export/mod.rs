@@ -168,9 +168,9 @@ impl ExportOptions {
             _ => {
                 let header = map.header();
                 let plan = plan.and_then(|of| plan::over(of, header.capture_end_ns, header.map_from_ego.as_ref()));
-                let style = PictureStyle { caption: picture::caption(header, &layer.name), plan, ..style.clone() };
+                let style = PictureStyle { plan, ..style.clone() };
                 let ending = style.channel.as_ref().map_or(".png".into(), |channel| format!("_{channel}.png"));
-                Ok(vec![(ending, picture::png(layer, &style)?)])
+                Ok(vec![(ending, picture::png(header, layer, &style)?)])
             }
         }
     }

@@ -5,8 +5,6 @@ use font8x8::legacy::BASIC_LEGACY;
 
 /// Width and height of a letter, in dots.
 pub const LETTER: usize = 8;
-/// Space between two pictures, in pixels.
-const GAP: usize = 4;
 /// Dots of a character that the font does not have: a filled box.
 const BOX: [u8; LETTER] = [0xff; LETTER];
 
@@ -73,36 +71,11 @@ impl Picture {
             self.rgb[(y + row) * self.width + x..][..picture.width].copy_from_slice(pixels);
         }
     }
-
-    /// Pictures side by side.
-    pub fn beside(pictures: &[Self]) -> Self {
-        let width = pictures.iter().map(|picture| picture.width + GAP).sum::<usize>().saturating_sub(GAP);
-        let height = pictures.iter().map(|picture| picture.height).max().unwrap_or(0);
-        let mut all = Self::new(width, height, [0; 3]);
-        let mut left = 0;
-        for picture in pictures {
-            all.place((left, 0), picture);
-            left += picture.width + GAP;
-        }
-        all
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn pictures_side_by_side_have_every_pixel_of_each() {
-        let [first, second] =
-            [(3, 2, 1), (5, 4, 2)].map(|(width, height, red)| Picture::new(width, height, [red, 0, 0]));
-        let both = Picture::beside(&[first, second]);
-        assert_eq!((both.width, both.height, both.rgb.len()), (3 + GAP + 5, 4, both.width * both.height));
-        let count = |red: u8| both.rgb.iter().filter(|pixel| pixel[0] == red).count();
-        assert_eq!([count(1), count(2)], [6, 20]);
-        assert_eq!((both.rgb[2][0], both.rgb[3 + GAP][0]), (1, 2));
-        assert_eq!(Picture::beside(&[]).rgb.len(), 0);
-    }
 
     #[test]
     fn what_is_drawn_beyond_the_edges_is_cut_off() {

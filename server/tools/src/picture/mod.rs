@@ -3,9 +3,9 @@
 //! The picture rotates with the vehicle: up is ahead, not north. It shows the classes in the colours of the layer's
 //! legend, or one channel: ids in one colour each, other values from dark to light. Safe points of the layer are drawn
 //! as lines between linked points, and circles with their radii; over them the path of a plan, its footprint at the
-//! end, and its goal. Under the map stand the caption, what the colours mean
-//! and a scale bar; the PNG's text `Comment` has the channel, its least and greatest value and its unit. The picture of
-//! a stale map has a red frame and the word STALE.
+//! end, and its goal. Under the map stand the stamp, what the colours mean and a scale bar; the PNG's text `Comment`
+//! has the channel, its least and greatest value and its unit. The picture of a stale map has a red frame and the word
+//! STALE.
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -46,14 +46,12 @@ const STALE_WORD: &str = "STALE";
 pub struct PictureStyle {
     /// Edge of the map in the picture, in pixels.
     pub pixels: u32,
-    /// Distance from the vehicle to the edge of the map, in metres; `None` shows the whole grid.
-    pub range_m: Option<f64>,
+    /// Distance from the vehicle to the edge of the map, in metres.
+    pub range_m: f64,
     /// Name of the channel; `None` shows the classes, or the first channel of a layer without classes.
     pub channel: Option<String>,
     /// Values of the first and the last colour of the channel; `None`: the least and the greatest of the layer.
     pub values: Option<[f64; 2]>,
-    /// Lines of text under the map, such as the stamp.
-    pub caption: Vec<String>,
     /// The plan that is drawn over the map, in the ego frame.
     pub plan: Option<v1::Plan>,
     /// True if the map is stale.
@@ -61,17 +59,13 @@ pub struct PictureStyle {
 }
 
 impl Default for PictureStyle {
-    /// 800 pixels, ours, because that fits a screen; the whole grid and the classes.
+    /// The classes in 800 pixels, which fit a screen, and 60 m by 60 m, in which a car is seen; both ours.
     fn default() -> Self {
-        Self { pixels: 800, range_m: None, channel: None, values: None, caption: Vec::new(), plan: None, stale: false }
+        Self { pixels: 800, range_m: 30.0, channel: None, values: None, plan: None, stale: false }
     }
 }
 
-/// Draws a layer.
-///
-/// # Errors
-/// If the style names a channel that the layer does not have.
-pub fn of_layer(layer: &Layer, style: &PictureStyle) -> Result<Picture> {
+fn of_layer(header: &v1::Header, layer: &Layer, style: &PictureStyle) -> Result<Picture> {
     let mut colours = match &style.channel {
         Some(name) => of_channel(layer, name)?,
         None => Colours::of_layer(layer),
@@ -80,25 +74,25 @@ pub fn of_layer(layer: &Layer, style: &PictureStyle) -> Result<Picture> {
         [*least, *greatest] = values;
     }
     let comment = scale_text(&colours, layer);
-    let meanings = match (&colours, &comment) {
+    let mut lines: Vec<_> = caption(header, &layer.name).into_iter().map(|line| (Swatch::None, line)).collect();
+    match (&colours, &comment) {
         (Colours::Classes(_, colours), _) => {
             let classes = layer.legend.iter().zip(colours);
-            classes.map(|(class, colour)| (Swatch::Colour(*colour), class.name.clone())).collect()
+            lines.extend(classes.map(|(class, colour)| (Swatch::Colour(*colour), class.name.clone())));
         }
-        (Colours::Values { .. }, Some(text)) => vec![(Swatch::Scale, text.clone())],
-        (_, text) => text.iter().map(|text| (Swatch::None, text.clone())).collect(),
-    };
-    let range_m = style.range_m.unwrap_or(layer.grid.range_m_max());
+        (Colours::Values { .. }, Some(text)) => lines.push((Swatch::Scale, text.clone())),
+        (_, text) => lines.extend(text.iter().map(|text| (Swatch::None, text.clone()))),
+    }
     let colour_at = |x_m, y_m| layer.grid.cell_at(x_m, y_m).map_or(UNKNOWN, |cell| colours.of_cell(layer, cell));
-    Ok(Picture { comment, ..draw(range_m, style, &layer.points, meanings, colour_at) })
+    Ok(Picture { comment, ..draw(style, &layer.points, lines, colour_at) })
 }
 
-/// Draws a layer and encodes the picture.
+/// Draws a layer of the map with this header, and encodes the picture.
 ///
 /// # Errors
-/// As [`of_layer`] and [`Picture::to_png`].
-pub fn png(layer: &Layer, style: &PictureStyle) -> Result<Vec<u8>> {
-    of_layer(layer, style)?.to_png().context("encode the picture")
+/// If the style names a channel that the layer does not have; as [`Picture::to_png`].
+pub fn png(header: &v1::Header, layer: &Layer, style: &PictureStyle) -> Result<Vec<u8>> {
+    of_layer(header, layer, style)?.to_png().context("encode the picture")
 }
 
 fn of_channel(layer: &Layer, channel: &str) -> Result<Colours> {
@@ -140,7 +134,7 @@ fn scale_text(colours: &Colours, layer: &Layer) -> Option<String> {
 
 /// The lines under a picture of a map: vehicle, layer, sequence and stamp; then the sensors that are not whole, with
 /// `partial` and why, or their state.
-pub fn caption(header: &v1::Header, layer: &str) -> Vec<String> {
+fn caption(header: &v1::Header, layer: &str) -> Vec<String> {
     let end_ns = u64::try_from(header.capture_end_ns).unwrap_or(0);
     let stamp = humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_nanos(end_ns));
     let mut lines = vec![format!("{} {layer} {} {stamp}", header.vehicle, header.sequence)];
@@ -154,16 +148,14 @@ pub fn caption(header: &v1::Header, layer: &str) -> Vec<String> {
     lines
 }
 
-/// Draws `range_m` around the vehicle: the colour of each point of the ego frame, safe points, the vehicle, and the
-/// lines with the meanings of the colours.
+/// Draws the colour of each point of the ego frame, safe points, the vehicle, the plan, and the lines under the map.
 fn draw(
-    range_m: f64,
     style: &PictureStyle,
     points: &[SafePoint],
-    meanings: Vec<(Swatch, String)>,
+    mut lines: Vec<(Swatch, String)>,
     colour_at: impl Fn(f64, f64) -> Rgb,
 ) -> Picture {
-    let side = style.pixels as usize;
+    let (side, range_m) = (style.pixels as usize, style.range_m);
     let pixel_m = 2.0 * range_m / side as f64;
     let metres = |pixel: usize| range_m - (pixel as f64 + 0.5) * pixel_m;
     let mut map = Picture::new(side, side, UNKNOWN);
@@ -172,8 +164,8 @@ fn draw(
     }
     // Column and row, from the upper left.
     let pixel = |x_m: f64, y_m: f64| [range_m - y_m, range_m - x_m].map(|m| m / pixel_m);
-    for (lines, colour, width) in [(safe_paths::circles(points), CIRCLE, 1), (safe_paths::links(points), LINK, 2)] {
-        for ends in lines.chunks_exact(2) {
+    for (strokes, colour, width) in [(safe_paths::circles(points), CIRCLE, 1), (safe_paths::links(points), LINK, 2)] {
+        for ends in strokes.chunks_exact(2) {
             draw_line(&mut map, pixel(ends[0][0], ends[0][1]), pixel(ends[1][0], ends[1][1]), colour, width);
         }
     }
@@ -186,9 +178,8 @@ fn draw(
     if style.stale {
         mark_stale(&mut map);
     }
-    let caption = style.caption.iter().map(|line| (Swatch::None, line.clone()));
-    let planned = style.plan.iter().map(|plan| (Swatch::Colour(PLAN), format!("plan {} {}", plan.planner, plan.text)));
-    legend::with_lines(&map, caption.chain(meanings).chain(planned).collect(), pixel_m)
+    lines.extend(style.plan.iter().map(|of| (Swatch::Colour(PLAN), format!("plan {} {}", of.planner, of.text))));
+    legend::with_lines(&map, lines, pixel_m)
 }
 
 /// Draws a straight line; what lies outside the map is left out.

@@ -1,4 +1,4 @@
-//! The guides of deploy/README.md, followed in a network of their own.
+//! The pages of deploy/guide, followed in a network of their own.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -9,29 +9,9 @@ use std::process::Command;
 use clearway_tests::serial::PACKAGES;
 use clearway_tests::{binaries, workspace};
 
-use super::{said, venv};
-
-/// The blocks of code of one section of the README: their language and their text, in order.
-fn blocks(section: &str) -> Vec<(String, String)> {
-    let readme = fs::read_to_string(workspace().join("deploy/README.md")).expect("deploy/README.md");
-    let heading = format!("## {section}\n");
-    let (_, text) = readme.split_once(&heading).unwrap_or_else(|| panic!("no section {section:?}"));
-    let text = text.split("\n## ").next().unwrap_or(text);
-    let mut blocks: Vec<(String, String)> = Vec::new();
-    let mut is_inside = false;
-    for line in text.lines() {
-        match line.strip_prefix("```") {
-            Some(language) if !is_inside => blocks.push((language.to_owned(), String::new())),
-            None if is_inside => {
-                let (_, block) = blocks.last_mut().expect("it has begun");
-                _ = writeln!(block, "{line}");
-            }
-            _ => {}
-        }
-        is_inside ^= line.starts_with("```");
-    }
-    blocks
-}
+use super::said;
+use crate::fixture::pages::{self, Block};
+use crate::fixture::venv;
 
 /// Starts the test: a network with a loopback interface and nothing else, and programs that end with the script.
 const HEAD: &str = "set -eu
@@ -70,11 +50,9 @@ fn the_guide_of_the_first_sensor_leads_to_a_map() {
     let _packages = PACKAGES.enter();
     let folder = tempfile::tempdir().expect("a folder");
     let mut script = SENSOR.to_owned();
-    let blocks = blocks("A real Velodyne in ten minutes");
-    let commands: Vec<_> =
-        blocks.iter().filter(|(language, _)| language == "sh").flat_map(|(_, of)| of.lines()).collect();
+    let commands = pages::commands_of("deploy/guide/first-sensor.md", &["sh"]);
     assert_eq!(commands.len(), 5, "{commands:?}");
-    for command in commands {
+    for command in &commands {
         // A running server keeps its terminal.
         match command.starts_with("clearway serve") {
             true => _ = writeln!(script, "{command} 2>serve.log &\nwait_until $! clearway get --layer drivability"),
@@ -98,7 +76,7 @@ fn the_guide_of_the_first_sensor_leads_to_a_map() {
 fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
     let _packages = PACKAGES.enter();
     let folder = tempfile::tempdir().expect("a folder");
-    let blocks = blocks("A fleet with TLS from nothing");
+    let blocks = pages::blocks("deploy/guide/fleet.md");
     let mut script = SENSOR.to_owned();
     // zenoh's router from its Python package, instead of the program.
     let router = venv::script("router.py");
@@ -106,7 +84,7 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
         [router.get_program()].into_iter().chain(router.get_args()).map(|word| word.to_string_lossy()).collect();
     _ = writeln!(script, "zenohd() {{ exec {} \"$2\"; }}", words.join(" "));
     let python = venv::client(&workspace());
-    for (language, block) in &blocks {
+    for Block { language, text: block } in &blocks {
         match (language.as_str(), block.split_whitespace().next()) {
             ("toml", _) => fs::write(folder.path().join("fleet.toml"), block).expect("a file of ours"),
             ("python", _) => {
@@ -146,8 +124,7 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
 #[test]
 fn the_example_of_the_configuration_is_valid_and_says_where_each_value_was_given() {
     let folder = tempfile::tempdir().expect("a folder");
-    let (_, example) =
-        blocks("Configuration").into_iter().find(|(language, _)| language == "toml").expect("an example");
+    let example = pages::blocks_of("deploy/guide/configuration.md", "toml").remove(0);
     fs::write(folder.path().join("clearway.toml"), &example).expect("a file of ours");
     let mut check = Command::new(binaries().join("clearway"));
     check.args(["check", "--set", "vehicle[car2].queue=4096"]).current_dir(folder.path());

@@ -120,7 +120,7 @@ fn rviz_subscribes_to_published_topics_with_their_durability_and_the_guide_sets_
     let guide = std::fs::read_to_string(workspace().join("client/ros2/README.md")).expect("the guide");
     let words: Vec<_> = guide.split_whitespace().map(|word| word.trim_matches(['`', ':', '\'', '.'])).collect();
     let set: Vec<_> = words.windows(2).filter(|pair| pair[0] == "--set").map(|pair| pair[1].to_owned()).collect();
-    assert_eq!(set.len(), 5, "{set:?}");
+    assert_eq!(set.len(), 9, "{set:?}");
     let config = Config::parse(COMMENTED, Path::new("clearway.toml"), &set).expect("known keys");
     assert!(config.zenoh.ros2.enabled && config.zenoh.ros2.dds_bridge && config.zenoh.ros2.tf);
 }
