@@ -233,7 +233,7 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
     assert_eq!(newest_map["name"], "clearway");
     assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 5);
     assert_eq!(newest_map["channels"]["/car/log"], "foxglove.Log");
-    let layout = std::fs::read_to_string(workspace().join("client/foxglove/clearway.json")).expect("the layout");
+    let layout = std::fs::read_to_string(workspace().join("server/guide/foxglove-layout.json")).expect("the layout");
     let panels = serde_json::from_str::<Value>(&layout).expect("JSON")["configById"].clone();
     let topics = panels["3D!maps"]["topics"].as_object().expect("topics");
     for topic in topics.keys().map(String::as_str).chain(panels["RosOut!states"]["topicToRender"].as_str()) {

@@ -2,8 +2,8 @@
 //!
 //! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`) and the other topics of the layer
 //! ([`ros::topics_of`]), `<namespace>/<vehicle>/plan` (`nav_msgs/msg/Path`: the newest path of the vehicle's planners,
-//! empty without one), `<namespace>/<vehicle>/replay_ended` (`std_msgs/msg/Bool`: true from the end of a replay until it
-//! is set back), and if configured its pose on `/tf`. For all: their states on `/diagnostics`
+//! empty without one), `<namespace>/<vehicle>/replay_ended` (`std_msgs/msg/Bool`: true from the end of a replay until
+//! it is set back), and if configured its pose on `/tf`. For all: their states on `/diagnostics`
 //! (`diagnostic_msgs/msg/DiagnosticArray`). All are reliable; clouds, `/tf` and states volatile, the others transient
 //! local with depth 1. rmw_zenoh has a topic under `<domain>/<topic>/<type>/<hash>`, and liveliness tokens under
 //! `@ros2_lv` announce the node and its publishers; the bridge has it under `<topic>`. The payload is CDR, with an

@@ -36,8 +36,8 @@ const ROUGH_MM: i16 = 50;
 const ROUGH_SCORE_MM: std::ops::Range<i16> = 50..110;
 /// Half the side of the box of which a share of 10 to 30 % is rough, in cells.
 const ROUGH_HALF: usize = 8;
-/// Bits of the number of cells of a box: the largest has 17 x 17. A sum of heights, at most 32.767 m in 9 x 9 cells, fits
-/// into the others.
+/// Bits of the number of cells of a box: the largest has 17 x 17. A sum of heights, at most 32.767 m in 9 x 9 cells,
+/// fits into the others.
 const CELLS_BITS: u32 = 9;
 /// Score over the least one with which a cell needs no neighbour, millimetres.
 const ALONE_MM: i16 = 80;
