@@ -81,7 +81,7 @@ export interface Plan {
 /** Opens a `MapUpdate` of MapService. */
 export function openUpdate(
   message: Uint8Array, base?: LiveMap | null,
-): { skipped: bigint; sent_ns: bigint; map: LiveMap; plan: Plan | null };
+): { skipped: bigint; left_out: bigint; sent_ns: bigint; map: LiveMap; plan: Plan | null };
 
 /** An invalid map. `reason` is the name of the fault in the golden vectors. */
 export class DecodeError extends Error {

@@ -9,8 +9,8 @@ import { DecodeError, MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX, WIRE_VERSION 
 import { countParts, readLayer, readLayerName, readMap, readMapUpdate } from "./protobuf.js";
 import { readSafePoints } from "./safe_points.js";
 
-// { skipped, sent_ns, map, plan }: a MapUpdate and its map; plan is null if there is none. 64-bit values are BigInt.
-// base: the map that deltas start from.
+// { skipped, left_out, sent_ns, map, plan }: a MapUpdate and its map; plan is null if there is none. 64-bit values are
+// BigInt. base: the map that deltas start from.
 export function openUpdate(message, base = null) {
   const update = readMapUpdate(message);
   if (update.sent_ns <= 0n) throw new DecodeError("sent_ns", `${update.sent_ns}; the age needs it`);

@@ -177,7 +177,7 @@ const PLAN = {
   12: ["text", string],
 };
 const MAP_UPDATE = {
-  1: ["map", bytes], 2: ["skipped", uint64], 3: ["sent_ns", sfixed64], 8: ["plan", message(PLAN)],
+  1: ["map", bytes], 2: ["skipped", uint64], 3: ["sent_ns", sfixed64], 4: ["left_out", uint64], 8: ["plan", message(PLAN)],
 };
 
 export const readMap = (from) => decode(MAP, from);

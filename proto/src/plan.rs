@@ -5,6 +5,8 @@ use crate::limits::{
 };
 use crate::v1::{Plan, PlanFrame, PlanGoal, Pose};
 
+/// Greatest number of a plan: that of a position, in metres. Ours: a map's frame may lie at the middle of the Earth.
+const NUMBER_MAX: f64 = 1e9;
 /// Half the width of the cross at a goal, in metres. Ours.
 const GOAL_M: f64 = 0.75;
 
@@ -53,9 +55,9 @@ pub enum PlanError {
         /// Number of numbers.
         count: usize,
     },
-    /// A number is NaN or infinite.
-    #[error("{field}[{index}] is {value}: finite numbers are allowed")]
-    NotFinite {
+    /// A number is NaN, infinite, or greater than any place on the Earth.
+    #[error("{field}[{index}] is {value}: finite numbers up to 1e9 are allowed")]
+    NotDrawable {
         /// The field.
         field: &'static str,
         /// Index of the number.
@@ -139,8 +141,9 @@ fn check_numbers(plan: &Plan) -> Result<(), PlanError> {
         ("map_from_ego", &pose),
     ];
     for (field, numbers) in fields {
-        if let Some(index) = numbers.iter().position(|number| !number.is_finite()) {
-            return Err(PlanError::NotFinite { field, index, value: numbers[index] });
+        // A range contains no NaN.
+        if let Some(index) = numbers.iter().position(|number| !(-NUMBER_MAX..=NUMBER_MAX).contains(number)) {
+            return Err(PlanError::NotDrawable { field, index, value: numbers[index] });
         }
     }
     let length = pose[3..].iter().map(|number| number * number).sum::<f64>().sqrt();

@@ -83,13 +83,14 @@ fn a_capture_in_a_loop_begins_again_at_its_end() {
     let data = UdpSocket::bind("127.0.0.1:0").unwrap();
     let to = format!("udp://{}", data.local_addr().unwrap());
     let mut command = Command::new(env!("CARGO_BIN_EXE_clearway"));
-    let mut sender =
-        command.args(["send", file.to_str().unwrap(), "--to", &to, "--loop"]).stdout(Stdio::null()).spawn().unwrap();
+    let sender =
+        command.args(["send", file.to_str().unwrap(), "--to", &to, "--loop"]).stdout(Stdio::piped()).spawn().unwrap();
     let mut buffer = [0; 1206];
     let first_bytes = [(); 6].map(|()| (data.recv(&mut buffer).unwrap(), buffer[0]).1);
-    sender.kill().unwrap();
-    sender.wait().unwrap();
+    Command::new("kill").args(["-INT", &sender.id().to_string()]).status().unwrap();
+    let said = sender.wait_with_output().unwrap();
     assert_eq!(first_bytes, [1, 2, 1, 2, 1, 2]);
+    assert!(said.status.success() && text(&said.stdout).starts_with("sent "), "{said:?}");
 }
 
 #[test]

@@ -63,7 +63,7 @@ export class MapStream {
   }
 
   // True if the map follows those received so far. Counts the gap before it.
-  #isNew({ map: { header }, skipped }) {
+  #isNew({ map: { header }, skipped, left_out }) {
     const last = this.#last;
     if (!last) return true;
     if (last.boot_id !== header.boot_id) {
@@ -75,7 +75,7 @@ export class MapStream {
       this.counts.repeated++;
       return false;
     }
-    const missing = ahead - 1n - skipped - this.#unreadable;
+    const missing = ahead - 1n - skipped - left_out - this.#unreadable;
     if (!this.#is_new_connection && missing > 0n) this.counts.lost += missing;
     return true;
   }

@@ -70,10 +70,10 @@ const varint = (n) => (n < 128 ? [n] : [(n & 127) | 128, ...varint(n >> 7)]);
 const field = (number, bytes) => [8 * number + 2, ...varint(bytes.length), ...bytes];
 
 // An encoded MapUpdate whose map has no layers.
-function update({ boot_id = 1, sequence, skipped = 0 }) {
+function update({ boot_id = 1, sequence, skipped = 0, left_out = 0 }) {
   const header = [0x11, boot_id, 0, 0, 0, 0, 0, 0, 0, 0x18, ...varint(sequence)];
   const map = field(1, header);
-  return Uint8Array.from([...field(1, map), 0x10, ...varint(skipped), 0x19, 1, 0, 0, 0, 0, 0, 0, 0]);
+  return Uint8Array.from([...field(1, map), 0x10, ...varint(skipped), 0x19, 1, 0, 0, 0, 0, 0, 0, 0, 0x20, ...varint(left_out)]);
 }
 
 // The counts, but those that are 0, after these updates; "restart" is a new connection.
@@ -101,10 +101,11 @@ test("only the newest of the maps that wait is drawn, and the others are counted
   assert.equal(stream.counts.replaced, 2n);
 });
 
-test("a gap in the sequence is lost unless the server skipped it or the page could not read it", () => {
+test("a gap in the sequence is lost unless the server skipped it, left it out or the page could not read it", () => {
   const two = { received: 2, replaced: 1 };
   assert.deepEqual(countsAfter({ sequence: 5 }, { sequence: 9 }), { ...two, lost: 3 });
   assert.deepEqual(countsAfter({ sequence: 5 }, { sequence: 9, skipped: 2 }), { ...two, lost: 1, skipped: 2 });
+  assert.deepEqual(countsAfter({ sequence: 5 }, { sequence: 15, skipped: 1, left_out: 8 }), { ...two, skipped: 1 });
   const unreadable = Uint8Array.of(0);
   assert.deepEqual(countsAfter({ sequence: 5 }, unreadable, { sequence: 7 }), { ...two, refused: 1 });
 });

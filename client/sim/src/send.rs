@@ -55,6 +55,8 @@ impl AddAssign for Sent {
 /// Datagrams that are due within this time are sent at once, so that the thread sleeps at most once a millisecond. The
 /// due times count from the beginning, so the long-run rate is exact.
 const BURST: Duration = Duration::from_millis(1);
+/// Longest time until a stop is seen.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
 
 /// Sends datagrams from the address `own` until there are no more or `until` is reached; blocks.
 ///
@@ -71,14 +73,14 @@ pub fn drive(
     let socket = UdpSocket::bind(own)?;
     // The system gives a connected socket alone the answers to earlier datagrams.
     socket.connect(data)?;
+    let is_stopped = || until.stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
     let began = Instant::now();
     let mut first_ns = None;
     let mut sent = Sent::default();
     for datagram in datagrams {
         let first_ns = *first_ns.get_or_insert(datagram.stamp_ns);
         let device_time = Duration::from_nanos(u64::try_from(datagram.stamp_ns - first_ns).unwrap_or(0));
-        let ended = until.device_time.is_some_and(|end| device_time > end);
-        if ended || until.stop.is_some_and(|stop| stop.load(Ordering::Relaxed)) {
+        if until.device_time.is_some_and(|end| device_time > end) || is_stopped() {
             break;
         }
         let due = match pace {
@@ -86,9 +88,9 @@ pub fn drive(
             Pace::Times(times) => device_time.div_f64(times),
             Pace::AsFastAsPossible => Duration::ZERO,
         };
-        let early = due.saturating_sub(began.elapsed());
-        if early > BURST {
-            std::thread::sleep(early);
+        let early = || Some(due.saturating_sub(began.elapsed())).filter(|early| *early > BURST);
+        while let Some(early) = early().filter(|_| !is_stopped()) {
+            std::thread::sleep(early.min(LOOK_EVERY));
         }
         let (to, count) = match datagram.kind {
             Kind::Data => (data, &mut sent.packets),

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::shared::exit::Exit;
 use super::shared::files;
-use super::shared::output::{counted, print_line};
+use super::shared::output::{counted, print_line, stop_flag};
 use super::tool_commands::progress_bar;
 
 /// Send the datagrams of a capture over UDP, at the recorded pace.
@@ -89,7 +89,7 @@ pub fn run(arguments: SendArguments) -> Result<Exit> {
     let any: IpAddr = if to.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() };
     let bar = progress_bar(files::open(&file)?.1);
     let options = SendOptions { file, to, telemetry_to, own: bind.unwrap_or((any, 0).into()), pace, repeats, faults };
-    let summary = send(&options, |bytes| bar.set_position(bytes))?;
+    let summary = send(&options, &*stop_flag()?, |bytes| bar.set_position(bytes))?;
     bar.finish_and_clear();
     print_line(&if json { document(&summary) } else { text(&summary, &options) })?;
     if summary.sent.refused > 0 {

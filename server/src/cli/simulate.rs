@@ -12,7 +12,7 @@ use clearway_tools::simulate::SimulatedDrive;
 
 use super::send::target;
 use super::shared::model::ModelParser;
-use super::shared::output::{counted, print_line};
+use super::shared::output::{counted, print_line, stop_flag};
 use super::tool_commands::progress_bar;
 
 /// The names of the scenes as the command line accepts them.
@@ -79,7 +79,7 @@ pub fn run(arguments: &SimulateArguments) -> Result<()> {
         (None, Some(to)) => {
             let to = target(to)?;
             let telemetry_to = telemetry_to.as_deref().map_or(Ok(to), target)?;
-            (drive.send(to, telemetry_to, *endless)?, format!("sent to {to}"))
+            (drive.send(to, telemetry_to, *endless, &*stop_flag()?)?, format!("sent to {to}"))
         }
         (None, None) => unreachable!("clap requires --out or --to"),
     };

@@ -6,6 +6,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error, Result, bail};
@@ -25,6 +26,9 @@ pub use clearway_sim::send::Pace;
 
 /// Longest gap between two datagrams that is kept, in nanoseconds; a longer one becomes none.
 const GAP_NS_MAX: i64 = 60_000_000_000;
+
+/// Time after which a file with a single datagram begins again, in nanoseconds. Ours: a revolution.
+const LONE_NS: i64 = 100_000_000;
 
 /// What is sent, where to, and how.
 #[derive(Clone, Debug)]
@@ -62,18 +66,19 @@ pub struct SendSummary {
     pub network: Option<Counts>,
 }
 
-/// Sends the datagrams of the file. `progress` is called with the bytes read.
+/// Sends the datagrams of the file, until another thread sets `stop`. `progress` is called with the bytes read.
 ///
 /// # Errors
 /// If the file cannot be read or has no Velodyne datagram, or a datagram cannot be sent. A file that is cut off is not
 /// an error: the summary says so.
-pub fn send(options: &SendOptions, progress: impl FnMut(u64)) -> Result<SendSummary> {
+pub fn send(options: &SendOptions, stop: &AtomicBool, progress: impl FnMut(u64)) -> Result<SendSummary> {
     let mut datagrams = RecordedDatagrams::open(&options.file, options.repeats, progress)?;
     let mut network = options.faults.map(Impairment::new);
     let began = Instant::now();
     let send = |arriving: &mut dyn Iterator<Item = Datagram>| {
         let (own, to, telemetry_to) = (options.own, options.to, options.telemetry_to);
-        drive(own, arriving, to, telemetry_to, options.pace, Until::default()).with_context(|| format!("send to {to}"))
+        let until = Until { stop: Some(stop), device_time: None };
+        drive(own, arriving, to, telemetry_to, options.pace, until).with_context(|| format!("send to {to}"))
     };
     let sent = match &mut network {
         None => send(&mut datagrams)?,
@@ -106,6 +111,8 @@ struct RecordedDatagrams<P> {
     error: Option<Error>,
     /// Stamp of the newest datagram as recorded, in nanoseconds; `None` at the beginning of the file.
     newest_ns: Option<i64>,
+    /// Number of datagrams of the file so far, and the stamp at which they began, without gaps that are left out.
+    pass: (i64, i64),
     /// Its stamp without the gaps that are left out; `None` before the first.
     sent_ns: Option<i64>,
 }
@@ -141,6 +148,7 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
             cut: None,
             error: None,
             newest_ns: None,
+            pass: (0, 0),
             sent_ns: None,
         })
     }
@@ -152,7 +160,12 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
             return Ok(true);
         }
         let Some(file) = self.again.as_ref().filter(|_| self.newest_ns.is_some()) else { return Ok(false) };
-        (self.source, self.newest_ns) = (DatagramSource::open(file)?, None);
+        self.source = DatagramSource::open(file)?;
+        // The mean gap of the file lies between its end and its beginning.
+        if let ((count, began_ns), Some(sent_ns)) = (self.pass, &mut self.sent_ns) {
+            *sent_ns += if count > 1 { (*sent_ns - began_ns) / (count - 1) } else { LONE_NS };
+        }
+        (self.newest_ns, self.pass) = (None, (0, 0));
         Ok(true)
     }
 
@@ -210,6 +223,7 @@ impl<P: FnMut(u64)> RecordedDatagrams<P> {
         let gap_ns = stamp_ns.saturating_sub(self.newest_ns.replace(stamp_ns).unwrap_or(stamp_ns));
         let gap_ns = if gap_ns > GAP_NS_MAX { 0 } else { gap_ns };
         let stamp_ns = *self.sent_ns.insert(self.sent_ns.map_or(stamp_ns, |sent_ns| sent_ns + gap_ns));
+        self.pass = if self.pass.0 == 0 { (1, stamp_ns) } else { (self.pass.0 + 1, self.pass.1) };
         self.read.push_back(Datagram { stamp_ns, kind, payload: payload.to_vec() });
     }
 

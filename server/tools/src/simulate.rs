@@ -3,6 +3,7 @@
 use std::io::{BufWriter, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
@@ -64,15 +65,15 @@ impl SimulatedDrive {
         Ok(sent)
     }
 
-    /// Sends the drive in real time to these addresses of data packets and telemetry; if it is endless, beyond its
-    /// duration.
+    /// Sends the drive in real time to these addresses of data packets and telemetry, until another thread sets `stop`;
+    /// if it is endless, beyond its duration.
     ///
     /// # Errors
     /// If a datagram cannot be sent.
-    pub fn send(&self, to: SocketAddr, telemetry_to: SocketAddr, is_endless: bool) -> Result<Sent> {
+    pub fn send(&self, to: SocketAddr, telemetry_to: SocketAddr, is_endless: bool, stop: &AtomicBool) -> Result<Sent> {
         let any: IpAddr = if to.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() };
         let vehicle = SimulatedVehicle::starting_at(self.scene.clone(), self.scanner(), now_ns());
-        let until = Until { device_time: (!is_endless).then_some(self.duration), ..Until::default() };
+        let until = Until { stop: Some(stop), device_time: (!is_endless).then_some(self.duration) };
         drive((any, 0).into(), vehicle, to, telemetry_to, Pace::RealTime, until)
             .with_context(|| format!("send to {to}"))
     }

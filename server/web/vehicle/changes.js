@@ -33,7 +33,7 @@ export class Changes {
   }
 }
 
-function entry({ at_ms, state, reason, file, lasted_ms }, grafana) {
+function entry({ at_ms, state, reasons, file, lasted_ms }, grafana) {
   const item = document.createElement("li"), badge = document.createElement("b"), at = new Date(at_ms);
   const time = document.createElement(grafana === null ? "time" : "a");
   item.dataset.state = state;
@@ -43,7 +43,7 @@ function entry({ at_ms, state, reason, file, lasted_ms }, grafana) {
   time.title = grafana === null ? at.toISOString() : `${at.toISOString()}, in Grafana`;
   if (grafana !== null) Object.assign(time, { href: grafana, target: "_blank", rel: "noreferrer" });
   const lasted = lasted_ms === null ? "since then" : `for ${coarse(lasted_ms)}`;
-  item.append(time, " ", badge, ` ${lasted}${reason && `: ${reason}`}`);
+  item.append(time, " ", badge, ` ${lasted}${reasons.length ? `: ${reasons.join(" · ")}` : ""}`);
   if (file) {
     const recorded = document.createElement("code");
     setText(recorded, file.split("/").at(-1));

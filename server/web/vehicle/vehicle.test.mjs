@@ -96,8 +96,8 @@ test("the history keeps ten minutes, and a value that is unknown is a gap and no
 });
 
 const CHANGES = [
-  { at_ms: 1_000_000, state: "ok", reason: "", file: "" },
-  { at_ms: 1_060_000, state: "error", reason: "no packets from top for 2.1 s", file: "drive.mcap" },
+  { at_ms: 1_000_000, state: "ok", reasons: [], file: "" },
+  { at_ms: 1_060_000, state: "error", reasons: ["no packets from top for 2.1 s"], file: "drive.mcap" },
 ];
 
 test("what the server kept comes before the statuses, and none of them is there twice", () => {

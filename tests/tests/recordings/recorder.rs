@@ -77,6 +77,23 @@ fn contents(file: &Path) -> (BTreeSet<u64>, BTreeSet<(u64, String)>) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn parts_are_one_drive_in_the_order_in_which_the_engine_took_their_events() {
+    let folder = tempfile::tempdir().unwrap();
+    let running = live(&folder.path().join("car.mcap")).await;
+    let mut groups = cut_at(&[8, 18]).into_iter();
+    let (first, mut second) = (groups.next().unwrap(), groups.next().unwrap());
+    // As a datagram of another sensor, whose socket was read later.
+    second[0].arrival_ns = first.last().unwrap().arrival_ns - 1_000_000;
+    feed(&running, first).await;
+    service(&running).await.split(v1::SplitRecordingRequest {}).await.unwrap();
+    feed(&running, second).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+    let [first, second] = ["car.mcap", "car.part-0002.mcap"].map(|part| folder.path().join(part).display().to_string());
+    let done = clearway_tests::run(Path::new("."), "clearway", &["replay", &first, &second]);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn each_part_is_verifiable_alone_and_together_they_hold_everything() {
     let folder = tempfile::tempdir().unwrap();
     let running = live(&folder.path().join("car.mcap")).await;

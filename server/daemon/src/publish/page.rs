@@ -135,6 +135,7 @@ async fn list(State(shown): State<Shown>, Extension(caller): Extension<Caller>) 
 /// Whose history is asked for.
 #[derive(Deserialize)]
 struct HistoryOf {
+    #[serde(default)]
     vehicle: String,
 }
 

@@ -11,7 +11,6 @@ use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 
 use super::health::{Facts, SILENT_AFTER, SensorFacts, State};
-use super::history::StateChange;
 use super::json::run_text;
 use super::message::server_name;
 use super::vehicle::{Changing, VehicleStatus, packet_counts};
@@ -97,14 +96,8 @@ impl VehicleStatus {
         let (state, reasons) = (health.state(), health.reasons().to_vec());
         let state_for = facts.up.saturating_sub(health.since());
         self.health_state.send_if_modified(|last| std::mem::replace(last, state) != state);
-        locked(&self.history).push_state(facts.up, state, |state| StateChange {
-            state,
-            reason: reasons.first().cloned().unwrap_or_default(),
-            file: self
-                .recorder
-                .get()
-                .map_or_else(String::new, |counts| counts.to_proto().file.replace(".unfinished.", ".")),
-        });
+        let file = || self.recorder.get().map_or_else(String::new, |counts| counts.to_proto().file);
+        locked(&self.history).push_state(facts.up, state, &reasons, || file().replace(".unfinished.", "."));
         drop(health);
         let changing = locked(&self.changing);
         let by_clock_ms = now_ns().saturating_sub(changing.counts.newest_capture_end_ns) as f64 / 1e6;

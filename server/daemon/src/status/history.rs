@@ -10,6 +10,8 @@ use super::health::State;
 
 /// Length of the history. Ours: who is called looks at it within minutes; Prometheus keeps days.
 pub const SPAN: Duration = Duration::from_secs(600);
+/// Time after the server's start from which a state counts. Ours: the longest revolution, and the first packets.
+const STARTS_FOR: Duration = Duration::from_secs(2);
 /// Most changes of the state. Ours: a state gets better only after three seconds, so there are no more in ten minutes.
 const CHANGES_MAX: usize = 400;
 
@@ -28,8 +30,8 @@ pub struct History {
 pub struct StateChange {
     /// The state: "ok", "warn" or "error".
     pub state: &'static str,
-    /// Its worst reason; empty without one.
-    pub reason: String,
+    /// Why, worst first, at the moment with the most reasons: the cause often shows after its first symptom.
+    pub reasons: Vec<String>,
     /// Part of the recording that was written then, by the name that it has when it is closed; empty without one.
     pub file: String,
 }
@@ -69,13 +71,25 @@ impl History {
         self.forget_changes(now);
     }
 
-    /// Adds the state, if it is another than the last one. `change` is asked only then.
-    pub fn push_state(&mut self, now: Duration, state: State, change: impl FnOnce(&'static str) -> StateChange) {
-        if self.changes.back().is_some_and(|(_, last)| last.state == state.as_str()) {
+    /// Adds the state with its reasons, if it is another than the last one; else keeps the reasons, if there are more.
+    /// `file` is asked only for another state. A start is no error: that nothing has come in the first seconds is left
+    /// out.
+    pub fn push_state(&mut self, now: Duration, state: State, reasons: &[String], file: impl FnOnce() -> String) {
+        if now < STARTS_FOR && state == State::Error {
             return;
         }
-        self.changes.push_back((now, change(state.as_str())));
-        self.forget_changes(now);
+        match self.changes.back_mut() {
+            Some((_, last)) if last.state == state.as_str() => {
+                if reasons.len() > last.reasons.len() {
+                    last.reasons = reasons.to_vec();
+                }
+            }
+            _ => {
+                let change = StateChange { state: state.as_str(), reasons: reasons.to_vec(), file: file() };
+                self.changes.push_back((now, change));
+                self.forget_changes(now);
+            }
+        }
     }
 
     /// The state in which the ten minutes began stays.
@@ -109,12 +123,14 @@ mod tests {
     #[test]
     fn the_ring_forgets_after_ten_minutes_and_counts_nothing_twice() {
         let mut history = History::default();
-        let says = |state| move |name| StateChange { state: name, reason: format!("{state:?}"), file: String::new() };
         for tick in 0..5 * 1200_u32 {
             let now = Duration::from_millis(200) * tick;
             // A minute of each state, again and again.
             let state = State::ALL[now.as_secs() as usize / 60 % 3];
-            history.push_state(now, state, says(state));
+            // The cause shows half a second after the symptom, and is gone first.
+            let reasons = ["the newest map is old".to_owned(), format!("{state:?}")];
+            let shown = if (3..200).contains(&(tick % 300)) { &reasons[..] } else { &reasons[..1] };
+            history.push_state(now, state, shown, String::new);
             history.push_row(now, [Some(f64::from(tick)), None, Some(10.5), Some(0.1), None]);
         }
         let now = Duration::from_millis(1_199_800);
@@ -126,7 +142,8 @@ mod tests {
         assert!(rows.windows(2).all(|two| two[0][0].as_i64().unwrap() + 1000 == two[1][0].as_i64().unwrap()));
         let changes = written["changes"].as_array().unwrap();
         assert_eq!(changes.len(), 11, "ten minutes, and the state in which they began");
-        assert_eq!(changes[0], json!({"at_ms": 1_340_200, "state": "ok", "reason": "Ok", "file": ""}));
+        let reasons = json!(["the newest map is old", "Ok"]);
+        assert_eq!(changes[0], json!({"at_ms": 1_340_200, "state": "ok", "reasons": reasons, "file": ""}));
         assert!(changes.windows(2).all(|two| two[0]["state"] != two[1]["state"]));
     }
 }

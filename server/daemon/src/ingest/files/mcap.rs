@@ -46,6 +46,7 @@ pub struct Source {
     waiting: VecDeque<Reading>,
     pose_gap: PoseGap,
     is_journal: bool,
+    is_later_part: bool,
     /// Sequence of the event after the newest one of the journal.
     next_event: u64,
 }
@@ -110,6 +111,7 @@ impl Source {
             waiting: VecDeque::new(),
             pose_gap: PoseGap::default(),
             is_journal: false,
+            is_later_part: next_event > 0,
             next_event,
         })
     }
@@ -122,6 +124,11 @@ impl Source {
     /// True if the readings so far came from a journal, which also contains the ends of its sources.
     pub fn is_journal(&self) -> bool {
         self.is_journal
+    }
+
+    /// True if the file is a later part of the recording of the file before it.
+    pub fn is_later_part(&self) -> bool {
+        self.is_later_part
     }
 
     /// What was read, ignored and refused, for people.

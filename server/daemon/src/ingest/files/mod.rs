@@ -151,7 +151,7 @@ impl Readings {
             };
             if let Some(reading) = next {
                 let is_journal = matches!(&self.open, Some(Open::Mcap(_, source)) if source.is_journal());
-                self.check_overlap(&reading, is_journal)?;
+                self.check_overlap(&reading)?;
                 self.note_unfinished(&reading, is_journal);
                 return Ok(Some(reading));
             }
@@ -180,18 +180,19 @@ impl Readings {
         }
     }
 
-    /// Refuses a file whose first reading is older than the last of the file before. The files of a split bag may
-    /// overlap a little; one that begins no later than the file before it has the same drive.
-    fn check_overlap(&mut self, reading: &Reading, is_journal: bool) -> Result<(), FilesError> {
-        let (file, is_bag) = match &self.open {
-            Some(Open::Capture(file, _)) => (file, false),
-            Some(Open::Mcap(file, _)) => (file, !is_journal),
-            _ => return Ok(()),
-        };
-        let newest_ns = self.pending_ends.0;
+    /// Refuses a file whose first reading is older than the last of the file before. The events of a recording stand in
+    /// the order in which the engine took them, also from part to part. The files of a split bag may overlap a little;
+    /// one that begins no later than the file before it has the same drive.
+    fn check_overlap(&mut self, reading: &Reading) -> Result<(), FilesError> {
         if !std::mem::take(&mut self.is_file_new) {
             return Ok(());
         }
+        let (file, is_bag) = match &self.open {
+            Some(Open::Capture(file, _)) => (file, false),
+            Some(Open::Mcap(file, source)) if !source.is_later_part() => (file, !source.is_journal()),
+            _ => return Ok(()),
+        };
+        let newest_ns = self.pending_ends.0;
         let began_ns = std::mem::replace(&mut self.file_began_ns, reading.arrival_ns);
         let may_overlap = is_bag
             && reading.arrival_ns > began_ns
