@@ -1,23 +1,28 @@
-//! `clearway recordings`: a store and a search -> the parts that it finds.
+//! `clearway recordings`: a store and a search -> the parts that it finds, copied if wanted.
 
+use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::time::UNIX_EPOCH;
 
-use anyhow::{Error, Result};
+use anyhow::{Context, Error, Result};
 use clap::Args;
 use serde_json::json;
+use tempfile::NamedTempFile;
 
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line};
+use clearway_daemon::store::fetch::copy;
 use clearway_daemon::store::index::{Entry, Found, Search, search};
 use clearway_daemon::store::location;
 use clearway_daemon::store::upload::reason;
 use clearway_journal::damage::utc;
 
-/// Find recordings in a store by vehicle, time, place and faults.
+/// Find recordings in a store by vehicle, time, place and faults, and fetch them.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway recordings --store /mnt/archive
-  clearway recordings --store s3://fleet/clearway --vehicle car --from 2026-01-01T12:00:00Z --near 120,-35")]
+  clearway recordings --store s3://fleet/clearway --vehicle car --from 2026-01-01T12:00:00Z --near 120,-35
+  clearway recordings --store /mnt/archive --vehicle car --faults --out incident")]
 pub struct RecordingsArguments {
     /// The store: a folder, also as file:///FOLDER, or s3://BUCKET/PREFIX with the environment variables of the AWS
     /// tools.
@@ -41,15 +46,18 @@ pub struct RecordingsArguments {
     /// Only parts with a fault.
     #[arg(long)]
     faults: bool,
+    /// Fetch the parts that are found into this folder; a file that is there already is not overwritten.
+    #[arg(long, value_name = "FOLDER")]
+    out: Option<PathBuf>,
     /// Print one JSON array.
     #[arg(long)]
     json: bool,
 }
 
-/// Searches and prints what is found.
+/// Searches, fetches if wanted, and prints what is found.
 ///
 /// # Errors
-/// If the store's URL is wrong or it does not answer.
+/// If the store's URL is wrong or it does not answer, or a file exists or cannot be written.
 pub fn run(options: &RecordingsArguments) -> Result<Exit> {
     let wanted = Search {
         vehicle: options.vehicle.clone(),
@@ -59,11 +67,21 @@ pub fn run(options: &RecordingsArguments) -> Result<Exit> {
         with_faults: options.faults,
     };
     let store = location::open_existing(&options.store)?;
-    let Found { entries, without_place, unreadable } = block_on(async {
-        search(&*store, &wanted)
-            .await
-            .map_err(|error| Error::msg(format!("store {}: {}", options.store, reason(&error))))
-    })?;
+    let of_store = |error| Error::msg(format!("store {}: {}", options.store, reason(&error)));
+    let Found { entries, without_place, unreadable } =
+        block_on(async { search(&*store, &wanted).await.map_err(of_store) })?;
+    if let Some(folder) = &options.out {
+        std::fs::create_dir_all(folder).with_context(|| format!("create the folder {}", folder.display()))?;
+        // A part has an entry for each vehicle.
+        let parts: BTreeSet<_> = entries.iter().map(|entry| entry.part.as_str()).collect();
+        for part in parts {
+            let file = folder.join(part.rsplit('/').next().unwrap_or(part));
+            let mut unfinished = NamedTempFile::new_in(folder)?;
+            block_on(async { copy(&*store, &part.into(), &mut unfinished).await })
+                .with_context(|| format!("fetch {part} to {}", file.display()))?;
+            unfinished.persist_noclobber(&file).with_context(|| format!("write {}", file.display()))?;
+        }
+    }
     if options.json {
         let found = json!({ "parts": entries, "without_place": without_place, "unreadable": unreadable });
         print_line(&format!("{found:#}"))?;
@@ -84,7 +102,7 @@ pub fn run(options: &RecordingsArguments) -> Result<Exit> {
 }
 
 fn line(entry: &Entry) -> String {
-    let list = |names: &std::collections::BTreeSet<String>| names.iter().cloned().collect::<Vec<_>>().join(", ");
+    let list = |names: &BTreeSet<String>| names.iter().cloned().collect::<Vec<_>>().join(", ");
     let faults = if entry.faults.is_empty() { String::new() } else { format!("; FAULTS: {}", list(&entry.faults)) };
     format!(
         "{}: {}, {} to {}, {}, sensors {}{faults}",

@@ -118,6 +118,13 @@ fn parts_are_found_in_a_folder_by_vehicle_time_place_and_faults() {
         assert_eq!(found(&[], &store, options), expected, "{options:?}");
     }
     assert_eq!(clearway(&[], &["recordings", "--store", &store, "--from", "today"]).status.code(), Some(3));
+    let out = folder.path().join("out");
+    let fetch = || clearway(&[], &["recordings", "--store", &store, "--faults", "--out", out.to_str().unwrap()]);
+    assert_eq!(fetch().status.code(), Some(0));
+    let fetched: Vec<_> = std::fs::read_dir(&out).unwrap().map(|file| file.unwrap().path()).collect();
+    assert_eq!(fetched.len(), 1, "{fetched:?}");
+    assert_eq!(std::fs::read(&fetched[0]).unwrap(), std::fs::read(&cut).unwrap());
+    assert_eq!(fetch().status.code(), Some(2), "a file that is there is not overwritten");
     assert_eq!(found(&[], &format!("file://{store}"), &[]), 2);
     let absent = folder.path().join("absent").display().to_string();
     for (url, said) in [

@@ -4,7 +4,7 @@ use std::io::Write;
 
 use anyhow::{Context, Result};
 use futures::TryStreamExt;
-use object_store::{ObjectStoreExt, path::Path as Key};
+use object_store::{ObjectStore, ObjectStoreExt, path::Path as Key};
 use tempfile::NamedTempFile;
 
 use super::location;
@@ -39,11 +39,19 @@ pub async fn list(url: &str) -> Result<Vec<String>> {
 /// If the store has no such recording or does not answer, or the copy cannot be written.
 pub async fn fetch(url: &str) -> Result<NamedTempFile> {
     let (root, key) = split(url);
-    let mut content = location::open_existing(&root)?.get(&key).await.with_context(|| url.to_owned())?.into_stream();
-    let mut copy = NamedTempFile::with_suffix(".mcap").context("a copy of a recording in a store")?;
-    while let Some(bytes) = content.try_next().await.with_context(|| url.to_owned())? {
-        copy.write_all(&bytes).with_context(|| format!("copy {url} to {}", copy.path().display()))?;
+    let mut file = NamedTempFile::with_suffix(".mcap").context("a copy of a recording in a store")?;
+    copy(&*location::open_existing(&root)?, &key, &mut file).await.with_context(|| url.to_owned())?;
+    Ok(file)
+}
+
+/// Copies an object of a store.
+///
+/// # Errors
+/// If the store has no such object or does not answer, or the copy cannot be written.
+pub async fn copy(store: &dyn ObjectStore, key: &Key, to: &mut impl Write) -> Result<()> {
+    let mut content = store.get(key).await?.into_stream();
+    while let Some(bytes) = content.try_next().await? {
+        to.write_all(&bytes).context("write the copy")?;
     }
-    copy.flush()?;
-    Ok(copy)
+    Ok(to.flush()?)
 }

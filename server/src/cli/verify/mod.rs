@@ -33,8 +33,8 @@ mod table;
 #[derive(Args)]
 #[command(
     after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
-no event or no map that can be judged, or is another drive than that of --against or has no map in common with it, 3
-wrong use. A file whose events make no map is no fault; its line says so.
+no event, has maps of which none can be judged, or is another drive than that of --against or has no map in common
+with it, 3 wrong use. A file in which no map is recorded, or whose events make none, is no fault; its line says so.
 
 Examples:
   clearway verify drive.mcap

@@ -47,10 +47,12 @@ pub enum FilesError {
         advice: String,
     },
     /// A folder has no file of a known kind.
-    #[error("{}: no pcap, pcapng, mcap, db3, bin or pcd file in this folder", file.display())]
+    #[error("{}: no pcap, pcapng, mcap, db3, bin or pcd file in this folder{}", file.display(), within(below))]
     Empty {
         /// The file or folder.
         file: PathBuf,
+        /// A folder in it that has such files, if there is one.
+        below: Option<PathBuf>,
     },
     /// A file of a vehicle begins before the file before it has ended.
     #[error(
@@ -160,10 +162,25 @@ pub fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError
         return Err(error);
     }
     if files.is_empty() {
-        return Err(FilesError::Empty { file: folder.to_owned() });
+        return Err(FilesError::Empty { file: folder.to_owned(), below: folder_below(folder) });
     }
     files.sort_by_cached_key(|(file, _)| order_of(file));
     Ok(files)
+}
+
+/// The first folder of a folder that has a file of a known kind.
+fn folder_below(folder: &Path) -> Option<PathBuf> {
+    let paths = |folder: &Path| -> Vec<PathBuf> {
+        let mut paths: Vec<_> = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).collect();
+        paths.sort();
+        paths
+    };
+    let has_drive = |folder: &PathBuf| paths(folder).iter().any(|file| kind_by_name(file).is_some());
+    paths(folder).into_iter().find(|below| below.is_dir() && has_drive(below))
+}
+
+fn within(below: &Option<PathBuf>) -> String {
+    below.as_ref().map_or_else(String::new, |below| format!("; give one of its folders, such as {}", below.display()))
 }
 
 /// The files that the `metadata.yaml` of a ROS 2 bag names and that are not in its folder.
