@@ -5,7 +5,7 @@ use crate::limits::{
 };
 use crate::v1::{Plan, PlanFrame, PlanGoal, Pose};
 
-/// Greatest number of a plan: that of a position, in metres. Ours: a map's frame may lie at the middle of the Earth.
+/// Greatest number of a plan, such as a position in metres. Ours: a map's frame may lie at the middle of the Earth.
 const NUMBER_MAX: f64 = 1e9;
 /// Half the width of the cross at a goal, in metres. Ours.
 const GOAL_M: f64 = 0.75;

@@ -84,7 +84,7 @@ pub fn run(arguments: &SimulateArguments) -> Result<()> {
         (None, None) => unreachable!("clap requires --out or --to"),
     };
     let (packets, telemetry) = (counted(sent.packets, "data packet"), counted(sent.telemetry, "telemetry datagram"));
-    let (seconds, sensor) = (seconds.as_secs_f64(), sensor.as_str());
+    let (seconds, sensor) = (sent.device_time.as_secs_f64(), sensor.as_str());
     print_line(&format!("{seconds:.1} s of {scene} with the sensor {sensor}: {packets} and {telemetry} {place}"))?;
     Ok(())
 }

@@ -72,7 +72,7 @@ function rank(card) {
   return state === "error" ? 0 : card.fresh === "stale" ? 1 : state === "warn" ? 2 : WELL;
 }
 
-// cards: [{ status, age_ms, fresh, began_ms, speed }]. The keys of those that are shown, in order.
+// cards: [{ status, age_ms, fresh, began_ms, speed }]. The keys of the shown cards, in order.
 export function chosen(cards, { order, only, text }) {
   const wanted = text.trim().toLowerCase();
   const isShown = (card) =>

@@ -1,5 +1,5 @@
 // The last ten minutes of a vehicle, which the server keeps: a row of numbers a second, and the changes of its state.
-// In: the answer of /history, and the statuses after it. Times are those of the server, in ms since the Unix epoch.
+// In: the answer of /history, and the statuses after it. Times are the server's, in ms since the Unix epoch.
 
 export const SPAN_MS = 600_000;
 // Grafana shows a change with so much before it, and as much after the next one.
@@ -8,7 +8,7 @@ const AROUND_MS = 120_000;
 export class History {
   // { at_ms, map_age_ms, latency_ms_total, map_rate_hz, loss, drivable_share }; a number that is not known is null.
   rows = [];
-  // { at_ms, state, reason, file }, oldest first.
+  // { at_ms, state, reasons, file }, oldest first.
   changes = [];
 
   load({ columns, rows, changes }) {
@@ -18,7 +18,7 @@ export class History {
     this.changes = changes;
   }
 
-  // Adds the numbers of a status; one that is not newer is in a row already.
+  // Adds the numbers of a status, unless a row as new has them already.
   push({ now_ns, map_age_ms, latency_ms, map_rate_hz, loss, drivable_share }) {
     const at_ms = Number(now_ns) / 1e6;
     if (at_ms <= (this.rows.at(-1)?.at_ms ?? 0)) return;

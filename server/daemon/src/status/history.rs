@@ -15,7 +15,7 @@ const STARTS_FOR: Duration = Duration::from_secs(2);
 /// Most changes of the state. Ours: a state gets better only after three seconds, so there are no more in ten minutes.
 const CHANGES_MAX: usize = 400;
 
-/// Names of a row's numbers: the fields of [`clearway_proto::v1::Vehicle`], `latency_ms_total` that of `latency_ms`.
+/// Names of a row's numbers: the fields of [`clearway_proto::v1::Vehicle`], and the total of `latency_ms`.
 pub const COLUMNS: [&str; 5] = ["map_age_ms", "latency_ms_total", "map_rate_hz", "loss", "drivable_share"];
 
 /// The last ten minutes of one vehicle.

@@ -9,7 +9,7 @@ use crate::wide::WideLoop;
 pub const STEPS: f32 = 1e6;
 /// Largest deviation of a point on the ground. Ours: a deviation of half the range is an edge; it bounds the sums.
 const DEVIATION_MAX: f32 = 0.5;
-/// Largest noise. Ours: that of a return from within the sensor's own case.
+/// Largest noise over the range. Ours: a return with more comes from within the sensor's own case.
 const NOISE_MAX: f32 = 4.0;
 /// A deviation that is not known, in steps.
 const UNKNOWN: i32 = i32::MIN;

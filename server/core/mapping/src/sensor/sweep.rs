@@ -252,7 +252,7 @@ impl Sweep {
         self.returns = 0;
     }
 
-    /// Removes from some points, sensor frame, those that the filter refuses, and adds the others as they were moved.
+    /// Adds the points, sensor frame, that the filter does not refuse, as they were moved.
     #[inline(always)]
     fn push_kept(
         &mut self,

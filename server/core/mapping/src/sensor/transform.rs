@@ -62,8 +62,8 @@ impl Default for MovedPoints {
 }
 
 impl MovedPoints {
-    /// Moves those that are kept of the first `points` to the front, and returns their number. Each is written, and the
-    /// place of the next advances past those that are kept, so that the loop has no branch.
+    /// Moves the kept ones of the first `points` to the front, and returns their number. Each point is written, and the
+    /// place of the next one advances if it is kept, so that the loop has no branch.
     #[inline(always)]
     pub(crate) fn close_up(&mut self, points: usize) -> usize {
         let mut kept = 0;

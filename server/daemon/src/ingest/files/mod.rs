@@ -182,7 +182,7 @@ impl Readings {
 
     /// Refuses a file whose first reading is older than the last of the file before. The events of a recording stand in
     /// the order in which the engine took them, also from part to part. The files of a split bag may overlap a little;
-    /// one that begins no later than the file before it has the same drive.
+    /// a file that begins no later than the file before it has the same drive.
     fn check_overlap(&mut self, reading: &Reading) -> Result<(), FilesError> {
         if !std::mem::take(&mut self.is_file_new) {
             return Ok(());
