@@ -123,6 +123,7 @@ impl<'a> TestBed<'a> {
             recording: journal,
             status: status.clone(),
             observer: None,
+            plan: None,
             replayed: None,
         };
         let mut rng = Rng::new(!plan.seed);

@@ -1,5 +1,7 @@
 //! Plans of planners: taken, recorded beside the maps, shown with the maps, and refused with their values.
 
+use std::time::Instant;
+
 use clearway_client::test::Replay;
 use clearway_client::{Client, ClientError, MapView, PlanError, Subscription, ZenohClient, now_ns};
 use clearway_daemon::record::verify;
@@ -13,6 +15,7 @@ use futures::{StreamExt, stream};
 use prost::Message;
 use tonic::Code;
 use tonic::transport::Channel;
+use zenoh::qos::CongestionControl;
 
 use super::{client, start};
 use crate::fixture::{config, feed, readings, recorded, until, within};
@@ -179,10 +182,18 @@ async fn a_plan_over_zenoh_is_taken_or_counted() {
     }
     let session = within("zenoh", async { zenoh::open(config).await }).await.unwrap();
     let of_another = v1::Plan { vehicle: "van".into(), ..good.clone() }.encode_to_vec();
-    let nowhere = v1::Plan { x: vec![], y: vec![], ..good }.encode_to_vec();
+    let nowhere = v1::Plan { x: vec![], y: vec![], ..good.clone() }.encode_to_vec();
     for (count, bytes) in (1..).zip([of_another, nowhere, vec![0xff], vec![0; 200_000]]) {
         within("zenoh", async { session.put("clearway/car/plan", bytes).await }).await.unwrap();
         until("the refusal is counted", || refused(&running) == count).await;
     }
+    // More at once than wait: those that the rate cannot have let through are counted.
+    let (began, before, good) = (Instant::now(), refused(&running), good.encode_to_vec());
+    for _ in 0..1000 {
+        let put = session.put("clearway/car/plan", good.clone()).congestion_control(CongestionControl::Block);
+        within("zenoh", async { put.await }).await.unwrap();
+    }
+    let taken_max = || 21 + began.elapsed().as_secs() * 20 + 20;
+    until("each is taken or counted", || refused(&running) - before + taken_max() >= 1000).await;
     within("shutdown", running.shutdown()).await.unwrap();
 }

@@ -104,6 +104,23 @@ async fn a_name_reaches_only_its_vehicles_and_layers() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
+async fn readiness_is_told_to_everybody_and_names_only_vehicles_that_the_caller_may_reach() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = with_roles(folder.path());
+    let elsewhere = Only { vehicles: vec!["van".into()], layers: Vec::new() };
+    config.grpc.access.only = [("ingester".to_owned(), elsewhere)].into();
+    let running = start(config).await;
+    let metrics = running.metrics.unwrap();
+    for (caller, is_named) in [(None, false), (Some("ingester"), false), (Some("reader"), true)] {
+        let (status, answer) = ask(metrics, &get("/readyz"), caller.map(|name| ("ours", name))).await;
+        assert_eq!((status, answer.contains("vehicle car: no packets")), (503, is_named), "{caller:?}: {answer}");
+        assert!(answer.contains("not ready\n"), "{answer}");
+    }
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn certificates_and_roles_change_without_losing_a_reader_that_keeps_its_role() {
     let mut config = secured(true);
     let running = start(config.clone()).await;

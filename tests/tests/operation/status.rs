@@ -42,7 +42,10 @@ async fn a_vehicle_that_never_had_a_packet_is_alive_not_ready_and_says_why() {
     let page = running.page.unwrap();
     assert_eq!(ask(page, "/healthz").await, ("HTTP/1.1 200 OK".to_owned(), "ok\n".to_owned()));
     let (head, body) = ask(page, "/readyz").await;
-    assert!(head.starts_with("HTTP/1.1 503") && body.starts_with("vehicle car: no packets from "), "{head} {body}");
+    assert!(
+        head.starts_with("HTTP/1.1 503") && body.starts_with("not ready\nvehicle car: no packets from "),
+        "{head} {body}"
+    );
 
     let mut client = grpc(&running).await;
     let mut updates = client.watch_status(v1::WatchStatusRequest::default()).await.unwrap().into_inner();
@@ -245,7 +248,7 @@ async fn a_vehicle_in_error_does_not_cost_the_others_their_server() {
     let running = Server::start(Setup { config, ..Setup::default() }).await.unwrap();
     let page = running.page.unwrap();
     let (head, body) = ask(page, "/readyz").await;
-    assert!(head.starts_with("HTTP/1.1 503") && body.lines().count() == 2, "{head} {body}");
+    assert!(head.starts_with("HTTP/1.1 503") && body.lines().count() == 3, "{head} {body}");
     let driving = Driving::to(&running);
     within("the first is ready", async {
         loop {

@@ -18,7 +18,8 @@ use tonic::transport::Channel;
 
 use crate::fixture::{self, within};
 
-/// A recorded drive of this many tenths of a second, one map each, with ego poses and with memory.
+/// A recorded drive of this many tenths of a second, one map each, with ego poses, with memory, and with a plan after
+/// half a second and after one and a half.
 async fn recorded_drive(folder: &Path, tenths: i64) -> PathBuf {
     recorded_drive_of("car", folder, tenths).await
 }
@@ -41,6 +42,14 @@ async fn recorded_drive_of(vehicle: &str, folder: &Path, tenths: i64) -> PathBuf
         }
         readings.push(reading);
     }
+    let first_ns = readings[0].arrival_ns;
+    for (after_ns, text) in [(500_000_000, "first"), (1_500_000_000, "second")] {
+        let (vehicle, stamp_ns, frame) = (vehicle.into(), first_ns + after_ns, v1::PlanFrame::Ego.into());
+        let plan =
+            v1::Plan { vehicle, stamp_ns, frame, x: vec![0.0], y: vec![0.0], text: text.into(), ..v1::Plan::default() };
+        readings.push(Reading { arrival_ns: stamp_ns, source: 0, body: Body::Plan(plan.encode_to_vec().into()) });
+    }
+    readings.sort_by_key(|reading| reading.arrival_ns);
     let queue = running.inputs[0].queue.clone();
     let push = move || readings.into_iter().try_for_each(|reading| queue.push_captured(reading));
     tokio::task::spawn_blocking(push).await.unwrap().unwrap();
@@ -194,6 +203,26 @@ async fn a_seek_to_any_of_a_hundred_moments_gives_the_map_of_the_straight_run() 
     let (summary, tested) = replayed(served(&drive, paused()), test).await;
     assert!(tested.is_some());
     assert!(!summary.unwrap().reached_end, "it was stopped");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_jump_restores_the_plan_that_was_in_force() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = recorded_drive(folder.path(), 20).await;
+    let replay = ReplayRun::start(served(&drive, paused())).await.unwrap();
+    let address = replay.running.grpc.unwrap().to_string();
+    let plans = replay.running.vehicles.0[0].wires.plans.subscribe();
+    let test = async {
+        let mut transport = transport(&address).await;
+        let state = transport.control(v1::ReplayControl::default()).await.unwrap().into_inner();
+        for (tenths, expected) in [(19, "second"), (10, "first"), (2, ""), (16, "second"), (4, "")] {
+            let seek_ns = Some(state.begin_ns + tenths * 100_000_000);
+            transport.control(v1::ReplayControl { seek_ns, ..Default::default() }).await.unwrap();
+            let text = plans.borrow().as_ref().map(|plan| plan.text.clone()).unwrap_or_default();
+            assert_eq!(text, expected, "after {tenths} tenths of a second");
+        }
+    };
+    within("a replay", replay.play(test)).await.unwrap();
 }
 
 /// Reads to the end of the replay; returns the last map.

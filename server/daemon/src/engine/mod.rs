@@ -24,6 +24,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::pipeline::Pipeline;
@@ -65,6 +66,8 @@ pub struct Engine {
     pub status: Arc<VehicleStatus>,
     /// Is called after each revolution.
     pub observer: Option<Observer>,
+    /// The newest event with a plan, as it is recorded; `None` before the first.
+    pub plan: Option<Bytes>,
     /// How the header of the next map differs from that of a live one; `None` if it does not.
     pub replayed: Option<Replayed>,
 }
@@ -106,6 +109,7 @@ impl Engine {
     /// Steps the pipeline without publishing or recording: a replay jumps. A refused event changes nothing but the
     /// counts, as in [`Engine::step`].
     pub fn step_silently(&mut self, event: &Event) {
+        self.keep_plan(event);
         self.update_layers();
         let _ = self.pipeline.step(event);
     }
@@ -116,9 +120,9 @@ impl Engine {
     }
 
     /// Publishes the newest map of a pipeline that was exchanged, or stepped without publishing; if it has none,
-    /// readers have none. They have no plan until the next one.
+    /// readers have none. The newest plan is published before it.
     pub fn publish_newest_map(&mut self) {
-        self.wires.plans.forget();
+        self.publish_plan();
         if self.pipeline.newest_map().is_none() {
             self.newest.send_replace(None);
             self.wires.sweeps.send_replace(None);
@@ -173,8 +177,8 @@ impl Engine {
         if let Some(recording) = &mut self.recording {
             recording.record_event(event);
         }
-        if let Body::Plan(plan) = &event.body {
-            self.wires.plans.publish(plan, self.replayed.map_or(0, |replayed| replayed.shift_ns));
+        if self.keep_plan(event) {
+            self.publish_plan();
         }
         let (began, waited) = (Instant::now(), duration(now_ns().saturating_sub(event.arrival_ns)));
         self.update_layers();
@@ -191,6 +195,17 @@ impl Engine {
             recording.keep_up(event, &mut self.pipeline);
         }
         outcome.map(|_| ())
+    }
+
+    /// True if the event holds a plan.
+    fn keep_plan(&mut self, event: &Event) -> bool {
+        let Body::Plan(plan) = &event.body else { return false };
+        self.plan = Some(plan.clone());
+        true
+    }
+
+    fn publish_plan(&self) {
+        self.wires.plans.publish(self.plan.as_ref(), self.replayed.map_or(0, |replayed| replayed.shift_ns));
     }
 
     /// Encodes the newest map and gives it to readers, recorder and observer. Its computation `began` after its event

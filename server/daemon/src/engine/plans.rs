@@ -32,7 +32,7 @@ pub enum PlanRefused {
     /// There are too many plans.
     #[error("more than {PLANS_MAX} plans in a second: this many are allowed")]
     Rate,
-    /// The event queue has no space, or is closed.
+    /// A queue on the way to the engine has no space, or is closed.
     #[error("the vehicle's queue is full: the engine does not keep up, or has stopped")]
     Queue,
 }
@@ -62,8 +62,8 @@ impl Plans {
         self.take(plan).inspect_err(|_| self.drops.record_refused_plan())
     }
 
-    /// Counts a message that is no plan of this vehicle.
-    pub fn refuse(&self, error: &PlanError) {
+    /// Counts a message that is no plan of this vehicle, or for which no place is left.
+    pub fn refuse(&self, error: &PlanRefused) {
         tracing::debug!(%error, "a plan is refused");
         self.drops.record_refused_plan();
     }
@@ -83,19 +83,12 @@ impl Plans {
         }
     }
 
-    /// Shows the plan of an event, its stamp moved by `shift_ns`. A recording may hold any bytes; what is no plan is
-    /// not shown.
-    pub(super) fn publish(&self, bytes: &Bytes, shift_ns: i64) {
-        let Ok(mut plan) = v1::Plan::decode(bytes.clone()) else { return };
-        plan.stamp_ns = plan.stamp_ns.saturating_add(shift_ns);
-        if plan::check(&plan, plan.stamp_ns).is_ok() {
-            self.newest.send_replace(Some(Arc::new(plan)));
-        }
-    }
-
-    /// Shows no plan until the next one: a replay jumps.
-    pub(super) fn forget(&self) {
-        self.newest.send_replace(None);
+    /// Shows the plan of an event in place of the one before, its stamp moved by `shift_ns`. A recording may hold any
+    /// bytes: for what is no plan no plan is shown.
+    pub(super) fn publish(&self, bytes: Option<&Bytes>, shift_ns: i64) {
+        let plan = bytes.and_then(|bytes| v1::Plan::decode(bytes.clone()).ok());
+        let plan = plan.map(|plan| v1::Plan { stamp_ns: plan.stamp_ns.saturating_add(shift_ns), ..plan });
+        self.newest.send_replace(plan.filter(|plan| plan::check(plan, plan.stamp_ns).is_ok()).map(Arc::new));
     }
 
     /// The newest plan, and the next ones.

@@ -6,7 +6,7 @@
 //! | [`faults`] | readings -> the same drive with lost sensors, packets, poses that jump |
 //! | [`clock`] | recorded time -> when an event is due, and how far its stamps move |
 //! | [`control`] | requests of clients -> commands; the state of the replay -> clients |
-//! | [`snapshots`] | pipelines at some moments -> the last one before another moment |
+//! | [`snapshots`] | vehicles at some moments -> the last one before another moment |
 //! | [`outcome`] | how a replay ended, or why it cannot go on |
 //! | [`vehicle`] | one vehicle: its engine and its queue |
 //! | [`play`] | readings, commands -> stepped engines |

@@ -100,8 +100,7 @@ impl Player {
         let state = input.state.borrow().clone();
         let readings = timeline.start(0)?;
         vehicles.iter().for_each(|vehicle| vehicle.engine.set_replay_phase(state.phase()));
-        let copies = vehicles.iter().filter(|_| options.is_served);
-        let copies = copies.map(|vehicle| (vehicle.engine.pipeline.clone(), vehicle.queue.position())).collect();
+        let copies = vehicles.iter().filter(|_| options.is_served).map(ReplayedVehicle::copy).collect();
         Ok(Self {
             clock: ReplayClock::new(state.rate),
             snapshots: Snapshots::new(copies),
@@ -408,15 +407,12 @@ impl Player {
         Ok(Ok(()))
     }
 
-    /// Goes to a recorded time and publishes the newest map of that moment.
+    /// Goes to a recorded time and publishes the newest map and plan of that moment.
     fn jump(&mut self, to_ns: i64, counts: bool) -> Result<(), PlayError> {
         let copy = self.snapshots.before(to_ns);
         let is_back = self.newest_ns.is_some_and(|newest_ns| to_ns < newest_ns);
         if is_back || copy.readings > self.taken {
-            for (vehicle, (pipeline, position)) in self.vehicles.iter_mut().zip(&copy.vehicles) {
-                vehicle.engine.pipeline = pipeline.clone();
-                vehicle.queue.set_position(*position);
-            }
+            self.vehicles.iter_mut().zip(&copy.vehicles).for_each(|(vehicle, copy)| vehicle.restore(copy));
             (self.taken, self.newest_ns) = (copy.readings, None);
             self.readings = self.timeline.start(copy.readings)?;
         }
@@ -449,12 +445,11 @@ impl Player {
         Ok(())
     }
 
-    /// Copies the pipelines, if the last copy is old enough.
+    /// Copies the vehicles, if the last copy is old enough.
     fn copy_if_due(&mut self) {
         let at_ns = self.state.position_ns;
         if self.options.is_served && !self.options.is_recorded && self.snapshots.is_due(at_ns, self.taken) {
-            let copies = self.vehicles.iter();
-            let vehicles = copies.map(|of| (of.engine.pipeline.clone(), of.queue.position())).collect();
+            let vehicles = self.vehicles.iter().map(ReplayedVehicle::copy).collect();
             self.snapshots.add(Snapshot { at_ns, readings: self.taken, vehicles });
         }
     }

@@ -1,8 +1,6 @@
-//! Copies of the pipelines at some moments of a replay, from which a jump begins.
+//! Copies of the vehicles at some moments of a replay, from which a jump begins.
 
-use clearway_mapping::pipeline::Pipeline;
-
-use crate::ingest::queue::QueuePosition;
+use super::vehicle::VehicleCopy;
 
 /// Most copies. Ours: one has about 20 MB with an HDL-64E and all layers, and a jump makes at most a sixteenth of the
 /// drive again.
@@ -17,7 +15,7 @@ pub struct Snapshot {
     /// Number of readings.
     pub readings: u64,
     /// State of each vehicle.
-    pub vehicles: Vec<(Pipeline, QueuePosition)>,
+    pub vehicles: Vec<VehicleCopy>,
 }
 
 /// The copies of one replay, in order; the first is that before the first reading.
@@ -28,7 +26,7 @@ pub struct Snapshots {
 
 impl Snapshots {
     /// Only the state before the first reading.
-    pub fn new(vehicles: Vec<(Pipeline, QueuePosition)>) -> Self {
+    pub fn new(vehicles: Vec<VehicleCopy>) -> Self {
         Self { copies: vec![Snapshot { at_ns: i64::MIN, readings: 0, vehicles }], period_ns: PERIOD_NS }
     }
 

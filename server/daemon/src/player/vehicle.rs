@@ -2,9 +2,12 @@
 
 use std::sync::mpsc::Receiver;
 
+use bytes::Bytes;
+use clearway_mapping::pipeline::Pipeline;
+
 use crate::engine::Engine;
 use crate::ingest::files::mcap::RefusedMessages;
-use crate::ingest::queue::{EventQueue, QueuedEvent};
+use crate::ingest::queue::{EventQueue, QueuePosition, QueuedEvent};
 
 /// One vehicle of a replay.
 pub struct ReplayedVehicle {
@@ -14,6 +17,27 @@ pub struct ReplayedVehicle {
     pub events: Receiver<QueuedEvent>,
     /// Its queue.
     pub queue: EventQueue,
+}
+
+/// What a jump restores of a vehicle.
+pub struct VehicleCopy {
+    pipeline: Pipeline,
+    plan: Option<Bytes>,
+    position: QueuePosition,
+}
+
+impl ReplayedVehicle {
+    /// A copy of the present state.
+    pub(super) fn copy(&self) -> VehicleCopy {
+        let Engine { pipeline, plan, .. } = &self.engine;
+        VehicleCopy { pipeline: pipeline.clone(), plan: plan.clone(), position: self.queue.position() }
+    }
+
+    /// Goes back or on to the state of a copy.
+    pub(super) fn restore(&mut self, copy: &VehicleCopy) {
+        (self.engine.pipeline, self.engine.plan) = (copy.pipeline.clone(), copy.plan.clone());
+        self.queue.set_position(copy.position);
+    }
 }
 
 /// Counts the messages that the files' readers have refused.

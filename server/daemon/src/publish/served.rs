@@ -9,6 +9,7 @@ use crate::config::Ros;
 use crate::encode::viewer::FrameNames;
 use crate::engine::newest::Newest;
 use crate::engine::wires::Wires;
+use crate::publish::listen::access::Caller;
 use crate::status::VehicleStatus;
 
 /// One vehicle, as publishers use it.
@@ -43,10 +44,10 @@ impl Vehicles {
         self.0.is_empty() || self.0.iter().any(|served| served.status.not_ready().is_none())
     }
 
-    /// A line for each vehicle of which no fresh map is made, with the worst reason; empty if there is none.
-    pub fn not_ready(&self) -> String {
+    /// A line for each vehicle in error that a client may reach, with the worst reason; empty if there is none.
+    pub fn not_ready(&self, caller: &Caller) -> String {
         let line = |served: &Served| Some(format!("vehicle {}: {}\n", served.status.name, served.status.not_ready()?));
-        self.0.iter().filter_map(line).collect()
+        self.0.iter().filter(|served| caller.may_reach(&served.status.name)).filter_map(line).collect()
     }
 
     /// The status of every vehicle.

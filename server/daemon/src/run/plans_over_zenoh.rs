@@ -9,16 +9,17 @@ use clearway_proto::limits::PLAN_BYTES_MAX;
 use clearway_proto::plan::PlanError;
 use clearway_proto::v1;
 use prost::Message;
+use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use zenoh::Session;
-use zenoh::handlers::RingChannel;
 use zenoh::sample::{Locality, Sample, SampleKind};
 
+use crate::engine::plans::PlanRefused;
 use crate::publish::Served;
 use crate::zenoh_session::{Senders, ZenohError};
 
-/// Most plans of a vehicle that wait to be read. Ours: the oldest of more is no news.
-const PLANS_MAX: usize = 4;
+/// Most plans of a vehicle that wait to be read; more are refused. Ours: as many as are taken at once.
+const PLANS_MAX: usize = 20;
 
 /// Takes the plans of a vehicle in a task of its own. Without `senders` every peer may send.
 ///
@@ -32,11 +33,15 @@ pub(super) async fn take(
 ) -> Result<(), ZenohError> {
     let (vehicle, plans) = (served.status.name.clone(), served.wires.plans.clone());
     let key = format!("clearway/{vehicle}/plan");
-    let samples = session.declare_subscriber(key.clone()).allowed_origin(Locality::Remote);
-    let samples = samples.with(RingChannel::new(PLANS_MAX)).await;
-    let samples = samples.map_err(ZenohError::of(format!("subscribe to {key}")))?;
+    let (waiting, mut samples) = mpsc::channel::<Sample>(PLANS_MAX);
+    let refused = plans.clone();
+    let subscriber = session.declare_subscriber(key.clone()).allowed_origin(Locality::Remote).callback(move |sample| {
+        waiting.try_send(sample).unwrap_or_else(|_| refused.refuse(&PlanRefused::Queue));
+    });
+    let subscriber = subscriber.await.map_err(ZenohError::of(format!("subscribe to {key}")))?;
     tasks.spawn(async move {
-        while let Ok(sample) = samples.recv_async().await {
+        let _subscriber = subscriber;
+        while let Some(sample) = samples.recv().await {
             let source = sample.source_info().map(|source| source.source_id().zid());
             let checked = match &mut senders {
                 Some(senders) => senders.check("/clearway.v1.PlanService/Send", Some(&vehicle), source).await,
@@ -45,7 +50,7 @@ pub(super) async fn take(
             match checked.map_err(|reason| PlanError::Message { reason }).and_then(|()| decode(&sample, &vehicle)) {
                 // A refusal is counted.
                 Ok(plan) => _ = plans.send(&plan),
-                Err(error) => plans.refuse(&error),
+                Err(error) => plans.refuse(&error.into()),
             }
         }
     });

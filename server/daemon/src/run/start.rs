@@ -144,6 +144,7 @@ impl Running {
             recording: None,
             status: status.clone(),
             observer,
+            plan: None,
             replayed: None,
         };
         self.inputs.push(VehicleInput { name, queue, udp: None });
