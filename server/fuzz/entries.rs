@@ -6,8 +6,6 @@ use std::path::Path;
 
 use bytes::{Buf, Bytes};
 use clearway_daemon::config::Config;
-use clearway_daemon::ingest::files::Readings;
-use clearway_daemon::ingest::files::mcap::McapOptions;
 use clearway_daemon::ingest::observation::{Limits, decode};
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::record::run_config;
@@ -17,6 +15,8 @@ use clearway_lidar::model::Model;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
+use clearway_replay::files::Readings;
+use clearway_replay::files::mcap::McapOptions;
 use prost::Message;
 
 /// An encoded observation.

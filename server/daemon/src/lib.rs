@@ -6,14 +6,13 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`config`] | one TOML file -> vehicles, sources, publishers, recorder |
-//! | [`ingest`] | datagrams, observations, ROS 2 messages, files -> numbered events on one queue a vehicle |
+//! | [`ingest`] | datagrams, observations, ROS 2 messages -> numbered events on one queue a vehicle |
 //! | [`engine`] | events -> journal, step of the pipeline, encoded maps, of the layers that readers want |
 //! | [`encode`] | map -> bytes, once; regions and deltas of them; event <-> bytes of the journal |
 //! | [`fleet`] | announcements of other servers -> their vehicles, and where they are served |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file, and back; verification |
-//! | [`player`] | recorded readings -> engines that are stepped in recorded time, and set back |
-//! | [`replay`] | recorded files and options -> a server whose engines a player steps |
+//! | [`replay_control`] | requests of clients -> commands for a replay; the state of the replay -> clients |
 //! | `store` | finished recordings -> a folder or a bucket, with an index; a search -> recordings |
 //! | [`status`] | ledger, rates and latency of each vehicle |
 //! | [`run`] | starts and stops all of these |
@@ -27,10 +26,9 @@ pub mod encode;
 pub mod engine;
 pub mod fleet;
 pub mod ingest;
-pub mod player;
 pub mod publish;
 pub mod record;
-pub mod replay;
+pub mod replay_control;
 pub mod run;
 pub mod status;
 #[cfg(feature = "store")]

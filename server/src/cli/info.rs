@@ -23,10 +23,10 @@ use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
 use crate::cli::shared::output::{counted, print_line, printable};
 use clearway_daemon::base::file_advice::open_to_read;
-use clearway_daemon::ingest::files::{Kind, Truncated, files_of_folder, kind, missing_parts};
 use clearway_journal::channel::Channel;
 use clearway_journal::encode::event_from_bytes;
 use clearway_journal::mcap_reader::{McapReader, Message};
+use clearway_replay::files::{Kind, Truncated, files_of_folder, kind, missing_parts};
 
 /// Describe a file: a recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd); or a folder.
 #[derive(Args)]

@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use anyhow::Result;
 use clap::Args;
-use clearway_daemon::player::faults::Fault;
-use clearway_daemon::replay::summary::why_no_map;
-use clearway_daemon::replay::{ReplayOptions, ReplayRun, ReplaySpeed, ReplaySummary, ServedReplay, describe};
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
+use clearway_replay::player::faults::Fault;
+use clearway_replay::summary::why_no_map;
+use clearway_replay::{ReplayOptions, ReplayRun, ReplaySpeed, ReplaySummary, ServedReplay, describe};
 use tokio::io::AsyncReadExt;
 use tokio::net::unix::pipe;
 use tokio::time::timeout;
@@ -153,7 +153,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// [`Exit::Unreadable`].
 ///
 /// # Errors
-/// [`ReplayError`](clearway_daemon::replay::ReplayError).
+/// [`ReplayError`](clearway_replay::ReplayError).
 pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     let ReplayArguments { files, record, json, speed, from: from_s, to: to_s, vehicle, extrinsics, .. } = arguments;
     if let (Some(from), Some(to)) = (from_s, to_s)

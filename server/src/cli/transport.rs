@@ -9,8 +9,8 @@ use serde_json::json;
 use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::replay::offset;
 use crate::cli::shared::output::{block_on, print_line, usage_error};
-use clearway_daemon::player::control::STEP_MAX;
-use clearway_daemon::replay::ReplaySpeed;
+use clearway_daemon::replay_control::STEP_MAX;
+use clearway_replay::ReplaySpeed;
 
 /// Control the replay of a server: pause, play, step, seek, range, rate, loop, lockstep.
 #[derive(Args)]

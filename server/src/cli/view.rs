@@ -5,8 +5,8 @@ use std::process::Command;
 
 use anyhow::Result;
 use clap::Args;
-use clearway_daemon::replay::{ReplayOptions, ReplayRun, ServedReplay, describe};
 use clearway_proto::v1::ReplayControl;
+use clearway_replay::{ReplayOptions, ReplayRun, ServedReplay, describe};
 
 use crate::cli::replay::{offset, print_remarks};
 use crate::cli::shared::exit::Exit;
@@ -35,7 +35,7 @@ pub struct ViewArguments {
 /// Serves the page until a signal.
 ///
 /// # Errors
-/// [`ReplayError`](clearway_daemon::replay::ReplayError).
+/// [`ReplayError`](clearway_replay::ReplayError).
 pub fn run(arguments: ViewArguments) -> Result<Exit> {
     let ViewArguments { files, from: seek_s, open } = arguments;
     let served = ServedReplay { seek_s, any_port: true, paused: true, ..ServedReplay::default() };

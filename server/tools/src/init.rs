@@ -19,8 +19,8 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
 use clearway_daemon::base::clock::now_ns;
 use clearway_daemon::config::Config;
-use clearway_daemon::ingest::files::ground_revolutions::{GroundRevolutions, points_of};
 use clearway_journal::counted::counted;
+use clearway_replay::files::ground_revolutions::{GroundRevolutions, points_of};
 
 /// Receive buffer of a socket, in bytes: that of a server.
 const RECEIVE_BUFFER_BYTES: usize = 4 << 20;

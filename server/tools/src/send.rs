@@ -11,12 +11,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error, Result, bail};
 use clearway_daemon::base::files;
-use clearway_daemon::ingest::files::{Kind as FileKind, kind};
 use clearway_journal::mcap_reader::McapReader;
 use clearway_lidar::capture::Capture;
 use clearway_lidar::capture_sensor::CaptureSensor;
 use clearway_lidar::packet::PACKET_LENGTH;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
+use clearway_replay::files::{Kind as FileKind, kind};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_sim::impair::{Counts, Faults, Impairment};
 use clearway_sim::send::{Sent, Until, drive};

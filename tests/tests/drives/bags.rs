@@ -1,7 +1,7 @@
 //! ROS 2 bags: a fault costs the part that has it, and no map has a pose of another epoch.
 
-use clearway_daemon::replay::Mount;
 use clearway_proto::v1;
+use clearway_replay::Mount;
 use clearway_ros::point_cloud2::PointCloud2;
 use clearway_ros::pose::{Odometry, Twist, tf_message_to_cdr};
 
@@ -319,7 +319,7 @@ async fn a_sensor_that_sends_empty_clouds_costs_the_others_nothing() {
 async fn a_drive_without_a_return_shows_nothing() {
     let empty = |ns| changed(ns, |cloud| (cloud.width, cloud.row_step, cloud.data) = (0, 0, &[]));
     let (summary, headers) = replayed_bag(drive_of(3, empty), &[]).await;
-    let why = clearway_daemon::replay::summary::why_no_map(&summary.mount, &summary.snapshot);
+    let why = clearway_replay::summary::why_no_map(&summary.mount, &summary.snapshot);
     assert!(headers.len() == 3 && !summary.shows_anything() && why == "none of 3 revolutions has a return", "{why}");
 }
 
@@ -329,7 +329,7 @@ async fn topics_that_are_not_read_are_named_with_what_helps() {
     let file = folder.path().join("ros1.mcap");
     let cloud = velodyne("velodyne", START_NS).to_cdr();
     write_bag(&file, vec![("/velodyne_points", "sensor_msgs/PointCloud2", START_NS, cloud)], "ros1");
-    let options = clearway_daemon::replay::ReplayOptions { files: vec![file], ..Default::default() };
+    let options = clearway_replay::ReplayOptions { files: vec![file], ..Default::default() };
     let (summary, _) = replayed(options).await.unwrap();
     let ros1 = "/velodyne_points (sensor_msgs/PointCloud2, 1 messages) is in ROS 1 encoding";
     assert!(summary.notes.iter().any(|note| note.contains(ros1)), "{:?}", summary.notes);

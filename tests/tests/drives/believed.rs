@@ -1,6 +1,6 @@
 //! What a bag states of its clouds is believed only if it can be right: frames, stamps, distances.
 
-use clearway_daemon::replay::summary::why_no_map;
+use clearway_replay::summary::why_no_map;
 use clearway_ros::pose::tf_message_to_cdr;
 
 use super::scene::*;

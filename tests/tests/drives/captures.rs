@@ -3,8 +3,8 @@
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
 
-use clearway_daemon::replay::{ReplayOptions, ReplaySummary};
 use clearway_lidar::model::Model;
+use clearway_replay::{ReplayOptions, ReplaySummary};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};

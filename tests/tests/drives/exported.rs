@@ -1,7 +1,7 @@
 //! An exported bag is a drive again.
 
-use clearway_daemon::replay::ReplayOptions;
 use clearway_journal::reader::{RecordedMessage, RecordingReader};
+use clearway_replay::ReplayOptions;
 use clearway_ros::Kind;
 use clearway_ros::pose::Odometry;
 

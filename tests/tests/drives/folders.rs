@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clearway_daemon::replay::ReplayOptions;
+use clearway_replay::ReplayOptions;
 use rusqlite::Connection;
 
 use super::scene::*;

@@ -4,10 +4,10 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use clearway_daemon::replay::{ReplayError, ReplayOptions, ReplaySummary, replay};
 use clearway_journal::mcap_reader::McapReader;
 use clearway_mapping::config::Extrinsics;
 use clearway_proto::v1;
+use clearway_replay::{ReplayError, ReplayOptions, ReplaySummary, replay};
 use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::{Field, PointCloud2};
 use clearway_ros::pose::{StampedTransform, tf_message_to_cdr};

@@ -144,7 +144,7 @@ async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
     let file = Path::new(env!("CLEARWAY_DRIVES")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
-    let drive = clearway_daemon::ingest::files::capture::Source::open(&file).unwrap();
+    let drive = clearway_replay::files::capture::Source::open(&file).unwrap();
     let readings: Vec<Reading> = drive.map(Result::unwrap).collect();
     assert_eq!(readings.len(), 976);
     let maps = assert_tunnelled_makes_the_maps_of_the_file(config(), readings).await;

@@ -6,11 +6,11 @@ use std::path::Path;
 
 use clearway_daemon::config::{Origin, Ros};
 use clearway_daemon::record::{run_config, verify};
-use clearway_daemon::replay::{Mount, ReplayError, ReplayOptions, ReplaySummary, replay};
 use clearway_lidar::model::Model;
 use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::event::Body;
+use clearway_replay::{Mount, ReplayError, ReplayOptions, ReplaySummary, replay};
 use clearway_ros::PointCloud2;
 use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::Field;

@@ -8,8 +8,8 @@ use std::process::{Command, Stdio};
 
 use clearway_client::{Client, ClientError, Observation, PublicKey, Subscription, Tls, ZenohClient, now_ns};
 use clearway_daemon::config::Only;
-use clearway_daemon::replay::{ReplayOptions, ReplayRun, ServedReplay};
 use clearway_daemon::run::{Running, Server, Setup};
+use clearway_replay::{ReplayOptions, ReplayRun, ServedReplay};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use zenoh::qos::CongestionControl;

@@ -3,11 +3,11 @@
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
-use clearway_daemon::ingest::files::Readings;
-use clearway_daemon::ingest::files::mcap::McapOptions;
 use clearway_daemon::ingest::queue::Reading;
 use clearway_journal::mcap_reader::McapReader;
 use clearway_journal::repair::repair;
+use clearway_replay::files::Readings;
+use clearway_replay::files::mcap::McapOptions;
 use mcap::WriteOptions;
 use mcap::records::op;
 use rusqlite::Connection;

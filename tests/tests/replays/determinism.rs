@@ -4,8 +4,8 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use clearway_daemon::record::verify;
-use clearway_daemon::replay::{ReplayOptions, replay};
 use clearway_lidar::model::Model;
+use clearway_replay::{ReplayOptions, replay};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::send::{Pace, Until, drive};

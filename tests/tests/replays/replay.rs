@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use clearway_daemon::record::verify;
-use clearway_daemon::replay::{Mount, ReplayError, ReplayOptions, ReplaySummary, describe, replay};
+use clearway_replay::{Mount, ReplayError, ReplayOptions, ReplaySummary, describe, replay};
 
 use crate::fixture;
 

@@ -8,11 +8,11 @@ use bytes::Bytes;
 use clearway_client::{Client, ClientError, MapStream, MapView, StreamEvent, Subscription};
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::record::verify;
-use clearway_daemon::replay::{ReplayError, ReplayOptions, ReplayRun, ReplaySummary, ServedReplay};
 use clearway_journal::encode::as_served;
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;
+use clearway_replay::{ReplayError, ReplayOptions, ReplayRun, ReplaySummary, ServedReplay};
 use prost::Message;
 use tonic::transport::Channel;
 

@@ -43,7 +43,7 @@ impl Default for Ros {
 
 impl Ros {
     /// The frames without the topics: for events from files.
-    pub(crate) fn frames_alone(self) -> Self {
+    pub fn frames_alone(self) -> Self {
         let Self { fixed_frame, ego_frame, .. } = self;
         let (pose, tf, sensors) = Default::default();
         Self { domain: 0, pose, fixed_frame, ego_frame, tf, sensors }

@@ -66,7 +66,7 @@ impl DropCounters {
 
     /// Counts `count` messages that were refused for `reason`. `source` is the index of a sensor, or
     /// [`clearway_mapping::event::UNKNOWN_SOURCE`].
-    pub(crate) fn record_refused_messages(&self, source: u16, reason: &'static str, count: u64) {
+    pub fn record_refused_messages(&self, source: u16, reason: &'static str, count: u64) {
         self.record(source, Cause::Observation, count);
         *locked(&self.refused_messages).entry(reason).or_default() += count;
     }

@@ -1,4 +1,4 @@
-//! How readings enter: from sockets, streams, topics and files to the event queue of their vehicle.
+//! How readings enter: from sockets, streams and topics to the event queue of their vehicle.
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -10,15 +10,13 @@
 //! | [`observation`] | `clearway.v1.Observation` -> event bodies, or the reason of the refusal |
 //! | [`admission`] | streams and observations -> those that are admitted now, by turns of their sources |
 //! | [`receipt`] | outcome of an event -> report to its client |
-//! | [`ros`] | ROS 2 messages, live or from a file -> readings |
-//! | [`files`] | captures, MCAP files, scans -> readings |
+//! | [`ros`] | ROS 2 messages -> readings |
 //! | [`queue`] | readings -> numbered events on one bounded queue a vehicle |
 //! | [`sensor_senders`] | who sends the data of each sensor, to tell when several do at once |
 //! | [`drops`] | counts of readings that did not become events |
 
 pub mod admission;
 pub mod drops;
-pub mod files;
 pub mod gateway;
 pub mod grpc;
 pub mod observation;

@@ -23,8 +23,8 @@ use super::page_recorder::PageRecorder;
 use super::page_replay::PageReplay;
 use super::served::Vehicles;
 use crate::fleet::Fleet;
-use crate::player::ReplayHandle;
 use crate::record::writer::RecorderControl;
+use crate::replay_control::ReplayHandle;
 use crate::status::{CONTENT_TYPE, prometheus, vehicle_json};
 
 #[derive(RustEmbed)]

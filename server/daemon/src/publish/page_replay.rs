@@ -10,7 +10,7 @@ use serde_json::json;
 use tokio::sync::watch;
 
 use super::listen::access::Caller;
-use crate::player::ReplayHandle;
+use crate::replay_control::ReplayHandle;
 
 /// The replay as one page reaches it.
 pub(super) struct PageReplay {
@@ -109,7 +109,7 @@ impl ReplayRequest {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::player::control::Command;
+    use crate::replay_control::Command;
 
     #[tokio::test]
     async fn a_step_that_waits_holds_up_no_request_after_it() {

@@ -19,11 +19,11 @@ use crate::engine::subscriptions::LayerSubscription;
 use crate::fleet::Fleet;
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::udp;
-use crate::player::ReplayHandle;
 use crate::publish::Vehicles;
 use crate::publish::listen::ListenerHandle;
 use crate::publish::listen::security::{Current, Security};
 use crate::record::writer::Recorder;
+use crate::replay_control::ReplayHandle;
 use crate::traces::Traces;
 
 /// Longest time of [`Running::shutdown_in_time`]. Ours: service managers wait 10 s or more before they kill a server.

@@ -8,8 +8,8 @@ use crate::base::held_sockets::HeldSockets;
 use crate::config::{Calibrations, Certificates, Config};
 use crate::engine::Observer;
 use crate::ingest::udp;
-use crate::player::ReplayHandle;
 use crate::record::writer::{IncompleteRecordingError, RecordError};
+use crate::replay_control::ReplayHandle;
 
 /// The parameters of a server.
 #[derive(Default)]

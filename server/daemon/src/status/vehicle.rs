@@ -315,7 +315,7 @@ impl VehicleStatus {
     }
 
     /// Records what the replay waits for in lockstep; empty: nothing. Its data are expected from then on.
-    pub(crate) fn set_replay_awaited(&self, awaited: &str) {
+    pub fn set_replay_awaited(&self, awaited: &str) {
         let mut changing = locked(&self.changing);
         awaited.clone_into(&mut changing.replay_awaited);
         changing.replay = changing.replay.map(|(phase, _)| (phase, self.started.elapsed()));

@@ -22,7 +22,7 @@ use crate::ingest::queue::Reading;
 
 /// Height over the ground from which a cloud in the vehicle's frame is taken to be seen, in metres. Ours, about the
 /// roof of a car.
-pub(super) const RAISED_M: f64 = 2.0;
+pub const RAISED_M: f64 = 2.0;
 
 /// The source of the ego poses.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -130,23 +130,23 @@ impl TopicDecoder {
 
     /// The decoder, with the points of these topics, which are in the vehicle's frame, moved to the frame of a sensor
     /// over its origin.
-    pub(super) fn lowering(self, lowered: BTreeSet<String>) -> Self {
+    pub fn lowering(self, lowered: BTreeSet<String>) -> Self {
         Self { lowered, ..self }
     }
 
     /// The decoder, with the arrivals of the clouds of these topics as their stamps.
-    pub(super) fn stamping(self, still: BTreeSet<String>) -> Self {
+    pub fn stamping(self, still: BTreeSet<String>) -> Self {
         Self { still, ..self }
     }
 
     /// The decoder, which refuses clouds in other frames than these, by topic: they are of another sensor.
-    pub(super) fn expecting(self, cloud_frames: BTreeMap<String, String>) -> Self {
+    pub fn expecting(self, cloud_frames: BTreeMap<String, String>) -> Self {
         Self { cloud_frames, ..self }
     }
 
     /// The decoder, which refuses poses of the topic of poses in another frame than this one; empty: any frame. Grids
     /// are published in this frame, and poses of two frames would jump.
-    pub(super) fn posed_in(self, fixed_frame: &str) -> Self {
+    pub fn posed_in(self, fixed_frame: &str) -> Self {
         Self { fixed_frame: fixed_frame.to_owned(), ..self }
     }
 

@@ -28,8 +28,8 @@ use replay::Replay;
 
 use crate::base::clock::now_ns;
 use crate::fleet::Fleet;
-use crate::player::ReplayHandle;
 use crate::record::writer::RecorderControl;
+use crate::replay_control::ReplayHandle;
 use crate::status::state_changed;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};

@@ -9,7 +9,7 @@ use tonic::{Request, Response, Status};
 use v1::replay_service_server::ReplayService;
 
 use super::super::listen::access::{Caller, caller};
-use crate::player::ReplayHandle;
+use crate::replay_control::ReplayHandle;
 
 /// Least time between two states of a stream.
 const PERIOD: Duration = Duration::from_millis(100);

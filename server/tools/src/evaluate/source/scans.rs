@@ -7,13 +7,13 @@ use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
-use clearway_daemon::ingest::files::kitti;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::mount::estimate;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
+use clearway_replay::files::kitti;
 
 use super::super::judge::{JudgedPoint, Scored, Vote};
 use super::super::options::EvaluateOptions;

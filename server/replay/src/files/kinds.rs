@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::capture::CaptureError;
 use super::kitti::ScanError;
 use super::mcap::McapError;
-use crate::base::file_advice::{advised, open_to_read};
+use clearway_daemon::base::file_advice::{advised, open_to_read};
 
 /// The kind of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

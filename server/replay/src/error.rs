@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::config::ConfigError;
-use crate::ingest::files::FilesError;
-use crate::player::control::ControlError;
+use crate::files::FilesError;
 use crate::player::faults::FaultError;
 use crate::player::outcome::PlayError;
-use crate::run::{ShutdownError, StartError};
+use clearway_daemon::config::ConfigError;
+use clearway_daemon::replay_control::ControlError;
+use clearway_daemon::run::{ShutdownError, StartError};
 use clearway_journal::reader::RecordingError;
 
 /// Why a replay failed.

@@ -8,9 +8,9 @@ use clearway_mapping::pipeline::NamedStatus;
 use clearway_mapping::sensor::mount::{MountError, MountEstimate};
 use serde_json::{Map, Value, json};
 
-use crate::base::counted::counted;
-use crate::ingest::files::Truncated;
-use crate::status::Snapshot;
+use crate::files::Truncated;
+use clearway_daemon::base::counted::counted;
+use clearway_daemon::status::Snapshot;
 
 /// Where the extrinsics of the first sensor come from.
 #[derive(Clone, Debug, PartialEq)]

@@ -6,7 +6,9 @@
 //! | [`options`] | what a replay does |
 //! | `plan` | options, files -> configuration, mount, readings |
 //! | `overrides` | configuration, keys of the command line -> configuration, calibration tables |
-//! | `bag` | topics of a ROS 2 bag -> sensors and their mounts |
+//! | [`files`] | captures, MCAP files, scans -> readings |
+//! | [`bag`] | topics of a ROS 2 bag -> sensors and their mounts |
+//! | [`player`] | readings -> engines that are stepped in recorded time, and set back |
 //! | `recordings` | files -> recordings of several vehicles; sensors that do not fit |
 //! | `ready_file` | the running server -> the file that tells programs its addresses |
 //! | [`summary`] | the state at the end -> text, JSON |
@@ -22,23 +24,25 @@ use std::time::{Duration, Instant};
 
 use clearway_proto::v1;
 
-use crate::config::{Config, Vehicle};
-use crate::ingest::files::Truncated;
-use crate::player::control::{ControlError, check};
+use crate::files::Truncated;
 use crate::player::faults::Faults;
 use crate::player::outcome::Played;
 use crate::player::play::{BEHIND_MAX, Player, PlayerOptions};
 use crate::player::timeline::{Remarks, Timeline};
 use crate::player::vehicle::ReplayedVehicle;
-use crate::player::{ReplayHandle, ReplayInput};
-use crate::run::{Running, Server, Setup, random};
-use crate::status::VehicleStatus;
+use clearway_daemon::config::{Config, Vehicle};
+use clearway_daemon::replay_control::{ControlError, check};
+use clearway_daemon::replay_control::{ReplayHandle, ReplayInput};
+use clearway_daemon::run::{Running, Server, Setup, random};
+use clearway_daemon::status::VehicleStatus;
 
-mod bag;
+pub mod bag;
 pub mod error;
+pub mod files;
 pub mod options;
 mod overrides;
 mod plan;
+pub mod player;
 mod ready_file;
 mod recordings;
 pub mod summary;

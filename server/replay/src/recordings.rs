@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use super::error::ReplayError;
 use super::options::ReplayOptions;
-use crate::config::{Calibrations, Config, Vehicle};
-use crate::ingest::files::{Kind, Readings};
-use crate::record::run_config;
+use crate::files::{Kind, Readings};
+use clearway_daemon::config::{Calibrations, Config, Vehicle};
+use clearway_daemon::record::run_config;
 use clearway_journal::reader::RecordingReader;
 
 /// A recording of this server.

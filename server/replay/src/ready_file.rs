@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::error::ReplayError;
-use crate::run::Running;
+use clearway_daemon::run::Running;
 
 /// A file with the addresses of a replay, which exists while the replay can be reached.
 pub(super) struct ReadyFile(PathBuf);

@@ -5,7 +5,6 @@
 //! | [`timeline`] | files of one or several vehicles -> readings in the order of recorded time |
 //! | [`faults`] | readings -> the same drive with lost sensors, packets, poses that jump |
 //! | [`clock`] | recorded time -> when an event is due, and how far its stamps move |
-//! | [`control`] | requests of clients -> commands; the state of the replay -> clients |
 //! | [`snapshots`] | vehicles at some moments -> the last one before another moment |
 //! | [`outcome`] | how a replay ended, or why it cannot go on |
 //! | [`vehicle`] | one vehicle: its engine and its queue |
@@ -15,12 +14,9 @@
 //! publishing, so its maps are those of a replay without jumps, with all that they remember.
 
 pub mod clock;
-pub mod control;
 pub mod faults;
 pub mod outcome;
 pub mod play;
 pub mod snapshots;
 pub mod timeline;
 pub mod vehicle;
-
-pub use control::{ControlError, ReplayHandle, ReplayInput};

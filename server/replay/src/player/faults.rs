@@ -9,8 +9,8 @@ use std::str::FromStr;
 use clearway_mapping::event::Body;
 use nalgebra::{Isometry3, Vector3};
 
-use crate::base::counted::counted;
-use crate::ingest::queue::Reading;
+use clearway_daemon::base::counted::counted;
+use clearway_daemon::ingest::queue::Reading;
 
 /// What [`Fault`] accepts, for errors and help.
 pub const SYNTAX: &str = "lost:SENSOR@FROM-TO, loss:PERCENT or loss:PERCENT@FROM-TO, clock:MS@AT, pose:X,Y,YAW@AT or \

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use super::timeline::Remarks;
-use crate::ingest::files::FilesError;
-use crate::ingest::queue::QueueClosedError;
+use crate::files::FilesError;
+use clearway_daemon::ingest::queue::QueueClosedError;
 
 /// How a replay ended.
 #[derive(Debug, Default)]

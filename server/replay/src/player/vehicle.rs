@@ -5,9 +5,9 @@ use std::sync::mpsc::Receiver;
 use bytes::Bytes;
 use clearway_mapping::pipeline::Pipeline;
 
-use crate::engine::Engine;
-use crate::ingest::files::mcap::RefusedMessages;
-use crate::ingest::queue::{EventQueue, QueuePosition, QueuedEvent};
+use crate::files::mcap::RefusedMessages;
+use clearway_daemon::engine::Engine;
+use clearway_daemon::ingest::queue::{EventQueue, QueuePosition, QueuedEvent};
 
 /// One vehicle of a replay.
 pub struct ReplayedVehicle {

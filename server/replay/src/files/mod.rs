@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 use clearway_mapping::event::Body;
 use clearway_mapping::scan_file::ScanFormat;
 
-use crate::ingest::queue::Reading;
+use clearway_daemon::ingest::queue::Reading;
 pub use kinds::{FilesError, Kind, Truncated, files_of_folder, kind, missing_parts};
 use mcap::{Before, McapOptions, RefusedMessages};
 

@@ -7,16 +7,17 @@ use std::time::{Duration, Instant};
 
 use clearway_proto::v1::{self, ReplayPhase};
 use tokio::runtime::Handle;
+use tokio::sync::oneshot;
 
 use super::clock::ReplayClock;
-use super::control::{Command, ControlError, ReplayInput, Step, check};
 use super::outcome::{PlayError, Played};
 use super::snapshots::{Snapshot, Snapshots};
 use super::timeline::{Ahead, Timeline};
 use super::vehicle::{ReplayedVehicle, report_refused};
-use crate::base::clock::now_ns;
-use crate::base::counted::counted;
-use crate::ingest::files::FilesError;
+use crate::files::FilesError;
+use clearway_daemon::base::clock::now_ns;
+use clearway_daemon::base::counted::counted;
+use clearway_daemon::replay_control::{Command, ControlError, ReplayInput, check};
 
 /// Interval at which a waiting replay looks for live observations and readers. Ours: short beside a revolution.
 const POLL: Duration = Duration::from_millis(20);
@@ -28,6 +29,14 @@ const EXACT: Duration = Duration::from_millis(2);
 pub const BEHIND_MAX: Duration = Duration::from_millis(300);
 /// Longest wait for readers to leave after the end, if the replay ends there. Ours: they have been told.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Maps that a client has asked for, after which the replay pauses.
+struct Step {
+    /// Number of maps that are not made yet.
+    left: u32,
+    /// Takes the state when they are made.
+    outcome: oneshot::Sender<Result<v1::ReplayState, ControlError>>,
+}
 
 /// What a replay does besides what clients can change ([`v1::ReplayState`]).
 #[derive(Clone, Copy, Debug)]

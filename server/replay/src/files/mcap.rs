@@ -6,11 +6,11 @@ use std::path::Path;
 
 use super::pose_gap::PoseGap;
 use super::unread_topics::unread_topics;
-use crate::base::counted::counted;
-use crate::ingest::queue::Reading;
-use crate::ingest::ros::available::AvailableTopics;
-use crate::ingest::ros::choice::ChoiceError;
-use crate::ingest::ros::decoder::TopicDecoder;
+use crate::bag::available::AvailableTopics;
+use crate::bag::choice::ChoiceError;
+use clearway_daemon::base::counted::counted;
+use clearway_daemon::ingest::queue::Reading;
+use clearway_daemon::ingest::ros::decoder::TopicDecoder;
 use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 use clearway_ros::RefusedPart;
 

@@ -7,8 +7,8 @@ use std::time::Duration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 
-use crate::player::control::RATES;
 use crate::player::faults::Fault;
+use clearway_daemon::replay_control::RATES;
 
 /// The files of a replay and what is made of them.
 #[derive(Clone, Debug, Default)]

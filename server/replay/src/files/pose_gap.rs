@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use clearway_mapping::event::Body;
 
-use crate::ingest::queue::Reading;
-use crate::ingest::ros::available::NEAR_NS;
+use crate::bag::available::NEAR_NS;
+use clearway_daemon::ingest::queue::Reading;
 
 /// TAI is ahead of UTC by this much from 2017 on.
 const TAI_S: f64 = 37.0;

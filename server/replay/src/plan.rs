@@ -21,17 +21,17 @@ use super::options::ReplayOptions;
 use super::overrides::overridden;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
-use crate::config::{Calibrations, Config, Origin, Recorder, Ros};
-use crate::ingest::files::ground_revolutions::{GroundRevolutions, points_of};
-use crate::ingest::files::mcap::McapOptions;
-use crate::ingest::files::{Kind, Readings};
-use crate::ingest::ros::choice::SensorTopic;
-use crate::ingest::ros::decoder::PoseSource;
+use crate::bag::choice::SensorTopic;
+use crate::files::ground_revolutions::{GroundRevolutions, points_of};
+use crate::files::mcap::McapOptions;
+use crate::files::{Kind, Readings};
 use crate::player::faults::Faults;
 use crate::player::timeline::{Timeline, Track};
-use crate::record::run_config;
-use crate::record::writer::{is_same_file, parent_of};
-use crate::run::Setup;
+use clearway_daemon::config::{Calibrations, Config, Origin, Recorder, Ros};
+use clearway_daemon::ingest::ros::decoder::PoseSource;
+use clearway_daemon::record::run_config;
+use clearway_daemon::record::writer::{is_same_file, parent_of};
+use clearway_daemon::run::Setup;
 use clearway_journal::reader::RecordingReader;
 
 /// What is known before the first event.

@@ -114,14 +114,6 @@ pub fn check(
     }
 }
 
-/// Maps that a client has asked for, after which the replay pauses.
-pub(super) struct Step {
-    /// Number of maps that are not made yet.
-    pub left: u32,
-    /// Takes the state when they are made.
-    pub outcome: oneshot::Sender<Result<v1::ReplayState, ControlError>>,
-}
-
 /// What the thread that replays is asked.
 #[derive(Debug)]
 pub enum Command {

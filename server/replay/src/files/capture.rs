@@ -12,8 +12,8 @@ use clearway_lidar::capture::{Capture, CaptureError as Error};
 use clearway_lidar::capture_sensor::CaptureSensor;
 use clearway_mapping::event::Body;
 
-use crate::base::file_advice::open_to_read;
-use crate::ingest::queue::Reading;
+use clearway_daemon::base::file_advice::open_to_read;
+use clearway_daemon::ingest::queue::Reading;
 
 /// A capture cannot be read further.
 #[derive(Debug, thiserror::Error)]

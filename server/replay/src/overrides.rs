@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::config::{Calibrations, Config};
+use clearway_daemon::config::{Calibrations, Config};
 
 use super::error::ReplayError;
 use super::options::ReplayOptions;
