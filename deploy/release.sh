@@ -11,7 +11,7 @@
 #   clearway.cdx.json                                what is in it (CycloneDX)
 #   SHA256SUMS                                       checksums of all these; sha256sum --check SHA256SUMS
 #
-# With BINARY no binary is built: that one is packed. Needs cargo, dpkg-deb, objdump and strip (binutils), python3 with
+# The binary needs no library. With BINARY none is built: that one is packed. Needs cargo, dpkg-deb, objdump and strip (binutils), python3 with
 # venv, npm.
 set -eu
 
@@ -36,9 +36,12 @@ check_libraries() {
 }
 
 if [ -z "$given" ]; then
-    cargo build --release --locked --package clearway --no-default-features --features sqlite,store,zenoh
+    # With the C library inside, so that it runs on every Linux, also on one that is older than this one.
+    target=$(rustc -vV | sed -n 's/^host: //p')
+    RUSTFLAGS="-C target-feature=+crt-static" cargo build --release --locked --target "$target" \
+        --package clearway --no-default-features --features sqlite,store,zenoh
 fi
-binary=${given:-${CARGO_TARGET_DIR:-target}/release/clearway}
+binary=${given:-${CARGO_TARGET_DIR:-target}/$target/release/clearway}
 version=$("$binary" --version | cut -d ' ' -f 2)
 name=clearway-$version-$architecture
 install -D "$binary" "$root/$name/bin/clearway"

@@ -19,8 +19,10 @@ umask 022
 
 version=$("$binary" --version | cut -d ' ' -f 2)
 architecture=$(dpkg --print-architecture)
-# The oldest C library that has every symbol of the binary.
+# The oldest C library that has every symbol of the binary; empty if the library is inside.
 glibc=$(strings -a "$binary" | grep -o '^GLIBC_2\.[0-9]*' | sort -u -t . -k 2 -n | tail -1 | cut -d _ -f 2)
+depends=${glibc:+"Depends: libc6 (>= $glibc), libgcc-s1
+"}
 root=$(mktemp -d)
 trap 'rm -rf "$root"' EXIT
 package=$root/clearway
@@ -56,8 +58,7 @@ Architecture: $architecture
 Maintainer: The Clearway developers <clearway@localhost>
 Section: science
 Priority: optional
-Depends: libc6 (>= $glibc), libgcc-s1
-Recommends: ca-certificates, openssl, procps, systemd
+${depends}Recommends: ca-certificates, openssl, procps, systemd
 Installed-Size: $(du -sk --apparent-size "$package" | cut -f 1)
 Description: LIDAR packets to maps of where a vehicle may drive
  Clearway reads the datagrams of Velodyne sensors, makes one map for each

@@ -141,6 +141,8 @@ async fn away(running: &Running, words: &[&str]) {
         named.map_or(words.is_empty(), |reason| !words.is_empty() && words.iter().all(|word| reason.contains(word)))
     };
     until(&format!("a router that is away with {words:?}"), is_named).await;
+    let without_router = running.vehicles.0[0].status.network.without_router();
+    assert_eq!(without_router.is_zero(), words.is_empty(), "{without_router:?}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]

@@ -43,7 +43,8 @@ async fn recorded_drive_of(vehicle: &str, folder: &Path, tenths: i64) -> PathBuf
         readings.push(reading);
     }
     let first_ns = readings[0].arrival_ns;
-    for (after_ns, text) in [(500_000_000, "first"), (1_500_000_000, "second")] {
+    let plans = [(5, "first"), (15, "second")].into_iter().filter(|(after, _)| *after < tenths);
+    for (after_ns, text) in plans.map(|(after, text)| (after * 100_000_000, text)) {
         let (vehicle, stamp_ns, frame) = (vehicle.into(), first_ns + after_ns, v1::PlanFrame::Ego.into());
         let plan =
             v1::Plan { vehicle, stamp_ns, frame, x: vec![0.0], y: vec![0.0], text: text.into(), ..v1::Plan::default() };

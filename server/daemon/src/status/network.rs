@@ -51,6 +51,11 @@ impl Network {
         *locked(&self.router) = away;
     }
 
+    /// Time since when no router is connected; zero if one is, or none is configured.
+    pub fn without_router(&self) -> Duration {
+        locked(&self.router).as_ref().map_or(Duration::ZERO, |away| away.since.elapsed())
+    }
+
     /// Notes when the certificates end, by their keys in the configuration, in seconds since the Unix epoch.
     pub fn set_certificates(&self, ends: &[(&'static str, i64)]) {
         ends.clone_into(&mut locked(&self.certificates));
