@@ -3,11 +3,11 @@
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import test from "node:test";
-import { crc32, decodeChannel } from "./codec.js";
-import { egoAt, gridOf, pixelCells } from "./grid.js";
-import * as limits from "./limits.js";
-import { LiveMap } from "./map.js";
-import { readLayer, readMap, readMapUpdate, WireError } from "./protobuf.js";
+import { crc32, decodeChannel } from "./src/codec.js";
+import { egoAt, gridOf, pixelCells } from "./src/grid.js";
+import * as limits from "./src/limits.js";
+import { LiveMap } from "./src/map.js";
+import { readLayer, readMap, readMapUpdate, WireError } from "./src/protobuf.js";
 
 const [U8, I8, U16] = [1, 2, 3], [RAW, ROWS, CHANGES] = [1, 2, 3];
 const channel = (cell_type, encoding, payload, raw, cell_count) => ({
