@@ -66,6 +66,8 @@ const COMMANDS: &[(&str, &str, Run)] = &[
     ("deploy/guide/service.md", "", HOST),
     ("server/guide/evaluation.md", "python3", Not("needs Patchwork++")),
     ("server/guide/evaluation.md", "", EVALUATE),
+    ("server/guide/pictures.md", "pip install", Not("the weekly run installs it from a copy")),
+    ("server/guide/pictures.md", "python3 client", Not("opens a window; a test runs it with --save")),
     ("server/guide/pictures.md", "", OFFLINE),
     ("server/guide/recordings.md", "clearway info", OFFLINE),
     ("server/guide/recordings.md", "clearway verify", OFFLINE),
