@@ -104,6 +104,20 @@ test("a golden delta on its base equals the golden whole map", () => {
   assert.notDeepEqual(decoded.layers[0].grid[2], [0n, 0n]);
 });
 
+test("a map that another protobuf decoder read equals the map of the bytes, and so does a delta on it", () => {
+  const message = (name) => {
+    const { header, layers } = readMap(goldenMap(name));
+    // Such decoders leave absent fields out.
+    const present = (layer) => Object.fromEntries(Object.entries(layer).filter(([, value]) => value !== null));
+    return { header, layers: layers.map((layer) => present(readLayer(layer))) };
+  };
+  const cells = (map) => map.names.map((name) => map.layer(name).channels.map((of) => map.layer(name).cells(of.name)));
+  const base = new LiveMap(message("delta_base")), whole = new LiveMap(goldenMap("delta_whole"));
+  assert.deepEqual(cells(base), cells(new LiveMap(goldenMap("delta_base"))));
+  assert.deepEqual(cells(new LiveMap(message("delta"), base)), cells(whole));
+  assert.throws(() => new LiveMap(message("delta")).layer(whole.names[0]), { name: "DecodeError", reason: "no_base" });
+});
+
 // Faults of the golden vectors that this decoder does not look for: the page draws no poses.
 const HEADERS_NOT_CHECKED = ["capture_ends_before_its_start", "pose_not_finite", "quaternion_of_norm_0"];
 

@@ -109,7 +109,7 @@ test("the pose of a map is a transform from the vehicle's frame to the fixed fra
   assert.equal(transformsOf({ ...message, header: { ...message.header, map_from_ego: null } }), undefined);
 });
 
-test("a delta gives the grid of the whole map if its base came before, in every panel, else nothing and a warning", () => {
+test("a delta on a map that came gives the grid of the whole map, in every panel, else nothing and a warning", () => {
   const [base, delta, whole] = ["delta_base", "delta", "delta_whole"].map((name) => ofVehicle("late", name));
   assert.equal(gridOf(delta), undefined);
   assert.equal(gridOf(delta), undefined);

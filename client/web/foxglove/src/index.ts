@@ -24,7 +24,7 @@ const FIELDS = ["red", "green", "blue", "alpha"].map((name, offset) => ({ name, 
 const MAPS_KEPT = 8;
 const kept = new Map<string, Map<string, LiveMap>>();
 
-/** A map has one layer in a recording and on a bridge; of several the one that ends the topic's name, else the first. */
+/** Of a map with several layers the one that ends the topic's name, else the first. Recordings have one in each map. */
 function grid(message: MapMessage, { topic }: Event): Grid {
   const layer_message = message.layers.find(({ name }) => topic.endsWith(`/${name}`)) ?? message.layers[0];
   if (!layer_message) throw new Error("a map without layers");
@@ -58,7 +58,7 @@ function keep(maps: Map<string, LiveMap>, key: string, map: LiveMap) {
 function transforms(message: MapMessage): FrameTransforms | undefined {
   const { header } = new LiveMap(message), pose = header.map_from_ego;
   if (!pose) return undefined;
-  const translation = { x: pose.x, y: pose.y, z: pose.z }, rotation = { x: pose.qx, y: pose.qy, z: pose.qz, w: pose.qw };
+  const { x, y, z, qx, qy, qz, qw } = pose, rotation = { x: qx, y: qy, z: qz, w: qw }, translation = { x, y, z };
   const timestamp = stamp(header.capture_end_ns), child_frame_id = baseFrame(header);
   return { transforms: [{ timestamp, parent_frame_id: "map", child_frame_id, translation, rotation }] };
 }
@@ -86,7 +86,8 @@ function orNothing<To>(convert: (message: MapMessage, event: Event) => To) {
 }
 
 export function activate(context: ExtensionContext): void {
-  const from = { type: "schema", fromSchemaName: "clearway.v1.Map" } as const;
-  context.registerMessageConverter({ ...from, toSchemaName: "foxglove.Grid", converter: orNothing(grid) });
-  context.registerMessageConverter({ ...from, toSchemaName: "foxglove.FrameTransforms", converter: orNothing(transforms) });
+  const register = (toSchemaName: string, converter: ReturnType<typeof orNothing>) =>
+    context.registerMessageConverter({ type: "schema", fromSchemaName: "clearway.v1.Map", toSchemaName, converter });
+  register("foxglove.Grid", orNothing(grid));
+  register("foxglove.FrameTransforms", orNothing(transforms));
 }

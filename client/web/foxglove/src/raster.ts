@@ -1,6 +1,6 @@
-// A layer -> coloured squares, as the server's own Foxglove output has them (server/daemon/src/encode/viewer/raster.rs).
-// A Cartesian layer keeps its cells and its axes. A radial layer is resampled: a square shows the worst of the radial
-// cell at its middle and those whose middles lie in it, so that no obstacle is lost. Unknown is worse than free.
+// A layer -> coloured squares, as the server has them (its raster.rs) in its own Foxglove output. A Cartesian layer
+// keeps its cells and its axes. A radial layer is resampled: a square shows the worst of the radial cell at its middle
+// and those whose middles lie in it, so that no obstacle is lost. Unknown is worse than free.
 
 import type { Layer, LegendEntry, Meaning } from "clearway-map";
 
@@ -14,7 +14,7 @@ export interface LayerMessage {
   } | null;
 }
 
-/** Squares in rows along the x axis. Square (0, 0) has its corner at x_m, y_m of the ego frame; yaw_rad: of the axes. */
+/** Squares in rows along x, which yaw_rad turns in the ego frame. The corner of square (0, 0) lies at x_m, y_m. */
 export interface Raster {
   width: number;
   height: number;
@@ -22,7 +22,7 @@ export interface Raster {
   x_m: number;
   y_m: number;
   yaw_rad: number;
-  /** Of a radial layer: the cell at the middle of each square, or NOWHERE; the square around the middle of each cell. */
+  /** Of a radial layer: the cell at the middle of each square, or NOWHERE, and the square of each cell's middle. */
   samples: { cell_at: Int32Array; square_of: Int32Array } | null;
 }
 
@@ -56,7 +56,9 @@ export function rasterOf(message: LayerMessage, layer: Layer): Raster {
   const half = Math.ceil(range_m / cell_m), side = 2 * half, corner_m = -half * cell_m;
   const middle = (index: number) => corner_m + (index + 0.5) * cell_m;
   const cell_at = new Int32Array(side * side);
-  for (let i = 0; i < cell_at.length; i++) cell_at[i] = layer.grid.cellAt(middle(i % side), middle(Math.floor(i / side)));
+  for (let i = 0; i < cell_at.length; i++) {
+    cell_at[i] = layer.grid.cellAt(middle(i % side), middle(Math.floor(i / side)));
+  }
   const square = (m: number) => Math.min(Math.max(Math.trunc((m - corner_m) / cell_m), 0), side - 1);
   const square_of = Int32Array.from({ length: row_radius_m.length * columns }, (_, cell) => {
     const row = Math.floor(cell / columns), azimuth = (((cell % columns) + 0.5) / columns) * 2 * Math.PI;
