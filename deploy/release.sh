@@ -8,6 +8,7 @@
 #   clearway_VERSION_ARCHITECTURE.deb                the Debian package of the first
 #   clearway-VERSION.tar.gz, clearway-*.whl          the Python client, to be built and built
 #   clearway-map-VERSION.tgz                         the decoder for browsers and Node
+#   clearway-foxglove-VERSION.foxe                   the extension for Foxglove
 #   clearway.cdx.json                                what is in it (CycloneDX)
 #   SHA256SUMS                                       checksums of all these; sha256sum --check SHA256SUMS
 #
@@ -61,7 +62,10 @@ python3 -m venv "$root/venv"
 "$root/venv/bin/pip" install --quiet build
 "$root/venv/bin/python" -m build --outdir "$folder" "$root/source/client/python" >/dev/null
 npm pack --silent --pack-destination "$folder" "$root/source/client/web" >/dev/null
+cd "$root/source/client/web/foxglove"
+npm install --silent --no-audit --no-fund >/dev/null
+npm run --silent package -- --out "$folder/clearway-foxglove-$version.foxe" >/dev/null
 
 cd "$folder"
-sha256sum -- *.tar.gz *.whl *.tgz *.deb *.cdx.json >SHA256SUMS
+sha256sum -- *.tar.gz *.whl *.tgz *.foxe *.deb *.cdx.json >SHA256SUMS
 cat SHA256SUMS

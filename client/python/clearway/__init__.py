@@ -22,7 +22,7 @@ from .layer import Channel, Layer, LegendEntry, Meaning, SafePoint
 from .map import Map
 from .questions import Along, Answer, Blocker, Obstacle
 from .recorder import Recorder
-from .recording import read
+from .recording import read, read_all
 from .shapes import Arc, Outline
 from .stream import MapStream, PassedOver
 from .tls import Tls
@@ -31,8 +31,8 @@ from .v1 import map_pb2, service_pb2
 __all__ = [
     "Along", "Answer", "Arc", "Blocker", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Ingester",
     "Layer", "LegendEntry", "Map", "MapStream", "Meaning", "Obstacle", "OccupancyGrid", "Outline", "PassedOver",
-    "PlanSender", "RadialGrid", "Recorder", "Refusal", "ReplayEnded", "SafePoint", "Tls", "get", "now_ns", "read", "status",
-    "vehicles", "watch",
+    "PlanSender", "RadialGrid", "Recorder", "Refusal", "ReplayEnded", "SafePoint", "Tls", "get", "now_ns", "read",
+    "read_all", "status", "vehicles", "watch",
 ]  # fmt: skip
 
 

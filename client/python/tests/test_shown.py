@@ -1,17 +1,27 @@
-"""What a map becomes elsewhere: a grid for ROS 2, a costmap, a drawing, a pickle, a line of text."""
+"""What a map becomes elsewhere: a grid for ROS 2, a costmap, a drawing, a pickle, a line of text, a view in Rerun."""
 
+import collections
 import math
 import pickle
+import runpy
 import subprocess
 import sys
 import zlib
+from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
 import clearway
 from clearway.freshness import Clock
-from clearway.v1 import map_pb2
+from clearway.v1 import journal_pb2, map_pb2
+
+try:
+    # The package has 170 MB; the weekly run of .ci/run installs it.
+    from rerun.chunk import RrdReader
+except ImportError:
+    RrdReader = None
 
 MEANINGS = [map_pb2.ClassMeaning.Value(f"CLASS_MEANING_{name}") for name in ("UNKNOWN", "FREE", "OCCUPIED")]
 CELL_M = 0.5
@@ -126,3 +136,84 @@ def test_neither_the_plugin_of_pytest_nor_the_package_imports_more_than_it_needs
     program = "import clearway_pytest, sys; assert 'clearway' not in sys.modules; import clearway; " \
         "assert not {'matplotlib', 'zenoh', 'mcap'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Two maps of two layers, the second one late, and a plan behind the first."""
+    mcap = pytest.importorskip("mcap.writer")
+    writer = mcap.Writer(str(tmp_path / "drive.mcap"))
+    writer.start()
+    names = ("journal", "map/freespace", "map/terrain")
+    topics = {name: writer.register_channel(f"/car/{name}", "protobuf", 0) for name in names}
+
+    def add(name, message):
+        writer.add_message(topics[name], 0, message.SerializeToString(), 0)
+
+    for sequence, seconds in ((12, 12), (13, 15)):
+        for name in ("freespace", "terrain"):
+            m = sample(layer(name, radial=name == "terrain"), heading=0.3)
+            stamp_ns = seconds * 1_000_000_000
+            m.header.sequence, m.header.capture_end_ns = sequence, stamp_ns
+            m.header.completed_ns, m.header.valid_until_ns = stamp_ns + 5_000_000, stamp_ns + 300_000_000
+            add(f"map/{name}", m._message)
+        add("journal", journal_pb2.Event(datagram=b"packet"))
+        if sequence == 12:
+            car = [2, 1, -1, 1, -1, -1, 2, -1]
+            plan = journal_pb2.Plan(stamp_ns=stamp_ns, x=[0, 5, 5], y=[0, 5, 5], footprint_m=car, text="blocked")
+            plan.frame = journal_pb2.PLAN_FRAME_EGO
+            add("journal", journal_pb2.Event(plan=plan))
+    writer.finish()
+    return tmp_path / "drive.mcap"
+
+
+def test_a_recording_gives_its_maps_with_all_layers_and_its_plans_in_order(recording):
+    read = list(clearway.read_all(recording))
+    assert [type(of).__name__ for of in read] == ["Map", "Plan", "Map"] and read[1].text == "blocked"
+    assert [(m.sequence, list(m.layers)) for m in read[::2]] == [(n, ["freespace", "terrain"]) for n in (12, 13)]
+    assert len(list(clearway.read_all(recording, "car"))) == 3
+    with pytest.raises(clearway.ClearwayError, match="no maps of vehicle 'bus'; the recording has /car/map/freespace"):
+        next(clearway.read_all(recording, "bus"))
+
+
+#: What the example logs of the recording above. The plan is cleared after 2 s.
+IN_RERUN = {
+    "world/car": 2, "world/car/freespace": 2, "world/car/terrain": 2, "legend/freespace": 1, "legend/terrain": 1,
+    "world/plan": 2, "world/plan/footprint": 1, "log": 1, "age_ms": 2, "state": 3,
+}  # fmt: skip
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "rerun_maps.py"
+
+
+def test_the_example_for_rerun_logs_layers_plans_ages_and_states_of_a_recording(recording, monkeypatch):
+    rerun = mock.MagicMock()
+    modules = {"rerun": rerun, "rerun.blueprint": rerun.blueprint}
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), str(recording), "--save", "drive.rrd"])
+    with mock.patch.dict(sys.modules, modules):
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
+    assert rerun.save.call_args.args == ("drive.rrd",) and not rerun.spawn.called
+    assert collections.Counter(call.args[0] for call in rerun.log.call_args_list) == IN_RERUN
+    states = [call.kwargs["state"] for call in rerun.StateChange.call_args_list]
+    assert states == ["fresh", "no newer map has arrived", "fresh"]
+    assert [call.args for call in rerun.Scalars.call_args_list] == [(5.0,), (5.0,)]
+    of = next(clearway.read(recording, "freespace"))["freespace"]
+    rgb = np.array([(entry.rgb >> 16, entry.rgb >> 8 & 255, entry.rgb & 255) for entry in of.legend_entries], np.uint8)
+    image = rerun.GridMap.call_args.kwargs
+    assert image["data"] == rgb[of.classes][::-1].tobytes() and image["cell_size"] == CELL_M
+    assert image["translation"] == pytest.approx((-9.9, -9.9, 0))
+    rings = rerun.Mesh3D.call_args.kwargs
+    assert rings["vertex_positions"].shape == (4 * 1600, 3) and rings["triangle_indices"].max() == 4 * 1600 - 1
+    turns = [call.kwargs["radians"] for call in rerun.RotationAxisAngle.call_args_list]
+    assert math.pi / 4 in turns, "the footprint lies along the path"
+
+
+if RrdReader is not None:
+
+    def test_rerun_reads_what_the_example_saves(recording, tmp_path):
+        saved = tmp_path / "drive.rrd"
+        subprocess.run([sys.executable, EXAMPLE, recording, "--save", saved], check=True)
+        reader, rows = RrdReader(str(saved)), collections.Counter()
+        for chunk in reader.stream().to_chunks():
+            rows[chunk.entity_path.lstrip("/")] += chunk.num_rows
+        del rows["__properties"]
+        assert rows == IN_RERUN
+        assert len(reader.blueprints()) == 1

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use clearway_tests::workspace;
 
 /// Folders of built, third-party and recorded files.
-const NOT_SOURCES: [&str; 6] = ["target", "node_modules", "corpus", "build", "__pycache__", "snapshots"];
+const NOT_SOURCES: [&str; 7] = ["target", "node_modules", "corpus", "build", "dist", "__pycache__", "snapshots"];
 
 /// The visible entries of a folder that are sources or folders of sources, in order.
 fn entries(folder: &Path) -> Vec<PathBuf> {

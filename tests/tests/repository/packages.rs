@@ -5,8 +5,9 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use clearway_tests::{cargo, workspace};
+use clearway_tests::{binaries, cargo, workspace};
 
+use crate::fixture::pages;
 use crate::fixture::venv::run;
 
 #[test]
@@ -53,4 +54,32 @@ fn the_package_of_the_browsers_decoder_is_used_from_typescript_where_only_it_is_
     let map = workspace().join("proto/golden/map.bin");
     let said = run(Command::new("node").arg("program.js").arg(map).current_dir(folder.path()), "node");
     assert_eq!(said, "drivable free 300n\n");
+}
+
+#[test]
+#[cfg_attr(not(clearway_npm), ignore = "needs npm: apt-get install npm")]
+fn the_extension_for_foxglove_is_packed_and_shows_the_grids_of_the_servers_own_output() {
+    let folder = tempfile::tempdir().unwrap();
+    for (from, to) in [("client/web", "client"), ("client/golden", "client"), ("proto/golden", "proto")] {
+        fs::create_dir_all(folder.path().join(to)).unwrap();
+        run(Command::new("cp").arg("-r").arg(workspace().join(from)).arg(folder.path().join(to)), "cp");
+    }
+    let exported = folder.path().join("town.foxglove.mcap");
+    let mut export = Command::new(binaries().join("clearway"));
+    export.args(["export", "client/golden/town.mcap", "--format", "foxglove", "--out"]).arg(&exported);
+    run(export.current_dir(folder.path()), "clearway says what is wrong");
+    let extension = folder.path().join("client/web/foxglove");
+    let commands = pages::commands("client/web/foxglove/README.md");
+    for command in &commands {
+        let mut words = command.split(' ');
+        let mut npm = Command::new(words.next().expect("npm"));
+        npm.args(words).args(["--no-audit", "--no-fund"]).current_dir(&extension).env("CLEARWAY_EXPORTED", &exported);
+        let said = run(&mut npm, "this test needs npm, and a package registry");
+        assert!(!said.contains("# SKIP"), "{said}");
+    }
+    assert_eq!(commands.len(), 3, "{commands:?}");
+    let packed = fs::read(extension.join("clearway.clearway-foxglove-0.1.0.foxe")).unwrap();
+    let names = ["package.json", "README.md", "CHANGELOG.md", "dist/extension.js"];
+    assert!(names.iter().all(|name| packed.windows(name.len()).any(|bytes| bytes == name.as_bytes())));
+    println!("the extension has {} bytes", packed.len());
 }

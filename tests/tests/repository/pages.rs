@@ -30,6 +30,7 @@ const FLEET: Run = By("the_guide_of_a_fleet_with_tls_leads_through_the_router_to
 const VERIFY: Run = By("the_verify_commands_end_with_the_exit_codes_that_the_page_gives");
 const EVALUATE: Run = By("the_evaluate_commands_of_the_page_succeed");
 const LIVE: Run = By("the_replay_commands_of_the_page_serve_a_drive_as_live");
+const FOXGLOVE: Run = By("the_extension_for_foxglove_is_packed_and_shows_the_grids_of_the_servers_own_output");
 const GOLDEN: Run = By("the_commands_of_the_golden_recordings_make_the_same_maps_again");
 const ROS: Run = Not("needs ROS 2; a test reads the keys that the commands set");
 
@@ -54,6 +55,7 @@ const COMMANDS: &[(&str, &str, Run)] = &[
     ("client/ros2/README.md", "clearway demo", Not("takes 30 s; the tests run the demo with other options")),
     ("client/ros2/README.md", "clearway export", OFFLINE),
     ("client/ros2/README.md", "", ROS),
+    ("client/web/foxglove/README.md", "", FOXGLOVE),
     ("deploy/README.md", "cargo build", Not("compiles everything once more; deploy/release.sh has the same command")),
     ("deploy/guide/containers.md", "docker", Not("needs docker; a test builds the image with buildah")),
     ("deploy/guide/containers.md", "", CLUSTER),
@@ -64,6 +66,8 @@ const COMMANDS: &[(&str, &str, Run)] = &[
     ("deploy/guide/service.md", "", HOST),
     ("server/guide/evaluation.md", "python3", Not("needs Patchwork++")),
     ("server/guide/evaluation.md", "", EVALUATE),
+    ("server/guide/pictures.md", "pip install", Not("the weekly run installs it from a copy")),
+    ("server/guide/pictures.md", "python3 client", Not("opens a window; a test runs it with --save")),
     ("server/guide/pictures.md", "", OFFLINE),
     ("server/guide/recordings.md", "clearway info", OFFLINE),
     ("server/guide/recordings.md", "clearway verify", OFFLINE),

@@ -34,7 +34,7 @@ struct Assets;
 /// The decoder, which is a package of its own. `../web/wire` links to it, for the tests in Node; a link that leads
 /// out of a folder is not followed here.
 #[derive(RustEmbed)]
-#[folder = "../../client/web/"]
+#[folder = "../../client/web/src/"]
 #[prefix = "wire/"]
 struct Decoder;
 

@@ -25,7 +25,7 @@ fn said(output: &Output) -> String {
 /// Makes a release of the built command in `folder`, and unpacks its Debian package into `root`.
 fn unpacked_release(folder: &Path, root: &Path) {
     let sums = succeeds(Command::new("deploy/release.sh").arg(folder).arg(binaries().join("clearway")));
-    for kind in [".tar.gz", ".whl", "clearway-map-0.1.0.tgz", ".deb", ".cdx.json"] {
+    for kind in [".tar.gz", ".whl", "clearway-map-0.1.0.tgz", ".foxe", ".deb", ".cdx.json"] {
         assert!(sums.lines().any(|line| line.ends_with(kind)), "{kind} in {sums}");
     }
     let version = env!("CARGO_PKG_VERSION");

@@ -195,7 +195,7 @@ function readChanges(bits, base, columns) {
 }
 
 // Typed arrays are little-endian on every machine that a browser runs on.
-const littleEndian = (bytes, Cells) => new Cells(bytes.slice().buffer);
+const littleEndian = (bytes, Cells) => new Cells(new Uint8Array(bytes).buffer);
 
 const CRC_TABLE = new Uint32Array(256);
 for (let n = 0; n < 256; n++) {

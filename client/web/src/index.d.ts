@@ -48,6 +48,7 @@ export interface Layer {
   grid: Grid;
   /** By the value of the channel `class`. Class 0 is unknown. */
   legend: LegendEntry[];
+  /** Of a map that another decoder read: as that decoder has it. */
   metrics: Map<string, number>;
   channels: Channel[];
   planes: { a: number; b: number; c: number }[];
@@ -58,13 +59,17 @@ export interface Layer {
 
 /** A map. Layers are decoded at the first access, which may throw a `DecodeError` or a `WireError`. */
 export class LiveMap {
-  /** `encoded`: a `clearway.v1.Map`. `base`: the map that deltas start from. */
-  constructor(encoded: Uint8Array, base?: LiveMap | null);
+  /**
+   * `map`: an encoded `clearway.v1.Map`, or that message as another protobuf decoder read it: the field names of
+   * map.proto, 64-bit numbers as bigint, bytes as Uint8Array. `base`: the map that deltas start from.
+   */
+  constructor(map: Uint8Array | object, base?: LiveMap | null);
   readonly header: Header;
   readonly names: string[];
-  /** Bytes of the encoded map. */
+  /** Bytes of the encoded map; 0 of a message. */
   readonly length: number;
-  layer(name: string): Layer | null;
+  /** `base`: as for the constructor, for this layer alone. */
+  layer(name: string, base?: LiveMap | null): Layer | null;
 }
 
 /** `Plan` of journal.proto, in the ego frame of the map that it came with. */

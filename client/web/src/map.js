@@ -1,5 +1,5 @@
-// In: the bytes of a MapUpdate or of a Map. Out: the map, whose layers and channels are decoded when they are first
-// needed, or a DecodeError or WireError that says what is wrong.
+// In: the bytes of a MapUpdate or of a Map, or a Map message as another protobuf decoder read it. Out: the map, whose
+// layers and channels are decoded when they are first needed, or a DecodeError or WireError that says what is wrong.
 
 import { baseByClass, decodeChannel } from "./codec.js";
 import { baseCells, baseLayer } from "./delta.js";
@@ -19,55 +19,63 @@ export function openUpdate(message, base = null) {
 
 // A map of which only the header and the layers' names are read at first.
 export class LiveMap {
-  #layer_bytes = new Map();
+  // By name: a Layer message, or its bytes.
+  #sources = new Map();
   #layers = new Map();
   #cells_claimed = 0;
 
-  // bytes: an encoded Map. base: the map that deltas start from, or null. With a base every layer is opened at once, so
-  // that no map keeps another one.
-  constructor(bytes, base = null) {
-    this.length = bytes.length;
-    if (this.length > MAP_BYTES_MAX) {
-      throw new DecodeError("too_long", `${this.length} bytes; at most ${MAP_BYTES_MAX} are allowed`);
-    }
-    const parts = countParts(bytes);
-    if (parts > MAP_PARTS_MAX) {
-      throw new DecodeError("too_many_parts", `${parts} parts; at most ${MAP_PARTS_MAX} are allowed`);
-    }
-    const { header, layers } = readMap(bytes);
+  // map: an encoded Map, or a Map message with the field names of map.proto, 64-bit numbers as BigInt and bytes as
+  // Uint8Array. base: the map that deltas start from, or null. With a base every layer is opened at once, so that no
+  // map keeps another one.
+  constructor(map, base = null) {
+    const is_encoded = ArrayBuffer.isView(map);
+    this.length = is_encoded ? map.length : 0;
+    const { header, layers } = is_encoded ? readChecked(map) : map;
     if (!header) throw new DecodeError("header", "the map has none");
     if (header.wire_version > WIRE_VERSION) {
       throw new DecodeError("version", `${header.wire_version}; versions up to ${WIRE_VERSION} are known`);
     }
     this.header = header;
     for (const layer of layers) {
-      const name = readLayerName(layer);
-      if (this.#layer_bytes.has(name)) throw new DecodeError("twice", `two layers are named ${name}`);
-      this.#layer_bytes.set(name, layer);
+      const name = ArrayBuffer.isView(layer) ? readLayerName(layer) : layer.name;
+      if (this.#sources.has(name)) throw new DecodeError("twice", `two layers are named ${name}`);
+      this.#sources.set(name, layer);
     }
     if (base) this.names.forEach((name) => this.layer(name, base));
   }
 
   // The names of the layers, in the order on the wire.
   get names() {
-    return [...this.#layer_bytes.keys()];
+    return [...this.#sources.keys()];
   }
 
   // The layer of this name; null if the map has none.
   layer(name, base = null) {
-    if (!this.#layer_bytes.has(name)) return null;
-    if (!this.#layers.has(name)) this.#layers.set(name, this.#open(this.#layer_bytes.get(name), base));
+    if (!this.#sources.has(name)) return null;
+    if (!this.#layers.has(name)) this.#layers.set(name, this.#open(this.#sources.get(name), base));
     return this.#layers.get(name);
   }
 
-  #open(bytes, base) {
-    const message = readLayer(bytes);
+  #open(source, base) {
+    const message = ArrayBuffer.isView(source) ? readLayer(source) : source;
     for (const { cell_count } of message.channels) this.#cells_claimed += cell_count;
     if (this.#cells_claimed > MAP_CELLS_MAX) {
       throw new DecodeError("too_many_cells", `${this.#cells_claimed} cells; a map may have ${MAP_CELLS_MAX}`);
     }
     return new Layer(message, baseLayer(message, this.header, base));
   }
+}
+
+// The Map message in these bytes, with layers as bytes.
+function readChecked(bytes) {
+  if (bytes.length > MAP_BYTES_MAX) {
+    throw new DecodeError("too_long", `${bytes.length} bytes; at most ${MAP_BYTES_MAX} are allowed`);
+  }
+  const parts = countParts(bytes);
+  if (parts > MAP_PARTS_MAX) {
+    throw new DecodeError("too_many_parts", `${parts} parts; at most ${MAP_PARTS_MAX} are allowed`);
+  }
+  return readMap(bytes);
 }
 
 // One layer: { name, legend: [{ name, meaning, colour }], grid, metrics, channels: [{ name, unit, scale, unknown }],

@@ -5,7 +5,7 @@ import { DecodeError } from "./limits.js";
 
 // The layer of map `base` that the delta `layer` starts from; null if `layer` is whole. header: of the map of `layer`.
 export function baseLayer(layer, header, base) {
-  if (layer.base_sequence === null) return null;
+  if ((layer.base_sequence ?? null) === null) return null;
   if (!base) throw new DecodeError("no_base", `layer ${layer.name} is a delta to that of map ${layer.base_sequence}`);
   const needed = [header.vehicle, header.boot_id, layer.base_sequence].join();
   const given = [base.header.vehicle, base.header.boot_id, base.header.sequence].join();
