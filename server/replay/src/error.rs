@@ -2,13 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::files::FilesError;
-use crate::player::faults::FaultError;
-use crate::player::outcome::PlayError;
 use clearway_daemon::config::ConfigError;
 use clearway_daemon::replay_control::ControlError;
 use clearway_daemon::run::{ShutdownError, StartError};
 use clearway_journal::reader::RecordingError;
+
+use crate::files::FilesError;
+use crate::player::faults::FaultError;
+use crate::player::outcome::PlayError;
 
 /// Why a replay failed.
 #[derive(Debug, thiserror::Error)]

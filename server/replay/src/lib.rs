@@ -7,7 +7,8 @@
 //! | `plan` | options, files -> configuration, mount, readings |
 //! | `overrides` | configuration, keys of the command line -> configuration, calibration tables |
 //! | [`files`] | captures, MCAP files, scans -> readings |
-//! | [`bag`] | topics of a ROS 2 bag -> sensors and their mounts |
+//! | [`topics`] | topics of a ROS 2 bag -> the topics to decode |
+//! | `bag` | these topics -> sensors and their mounts |
 //! | [`player`] | readings -> engines that are stepped in recorded time, and set back |
 //! | `recordings` | files -> recordings of several vehicles; sensors that do not fit |
 //! | `ready_file` | the running server -> the file that tells programs its addresses |
@@ -22,6 +23,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
+use clearway_daemon::config::{Config, Vehicle};
+use clearway_daemon::replay_control::{ControlError, ReplayHandle, ReplayInput, check};
+use clearway_daemon::run::{Running, Server, Setup, random};
+use clearway_daemon::status::VehicleStatus;
 use clearway_proto::v1;
 
 use crate::files::Truncated;
@@ -30,13 +35,8 @@ use crate::player::outcome::Played;
 use crate::player::play::{BEHIND_MAX, Player, PlayerOptions};
 use crate::player::timeline::{Remarks, Timeline};
 use crate::player::vehicle::ReplayedVehicle;
-use clearway_daemon::config::{Config, Vehicle};
-use clearway_daemon::replay_control::{ControlError, check};
-use clearway_daemon::replay_control::{ReplayHandle, ReplayInput};
-use clearway_daemon::run::{Running, Server, Setup, random};
-use clearway_daemon::status::VehicleStatus;
 
-pub mod bag;
+mod bag;
 pub mod error;
 pub mod files;
 pub mod options;
@@ -46,6 +46,7 @@ pub mod player;
 mod ready_file;
 mod recordings;
 pub mod summary;
+pub mod topics;
 
 pub use error::ReplayError;
 pub use options::{ReplayOptions, ReplaySpeed, ServedReplay};

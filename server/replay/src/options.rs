@@ -4,11 +4,11 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
+use clearway_daemon::replay_control::RATES;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 
 use crate::player::faults::Fault;
-use clearway_daemon::replay_control::RATES;
 
 /// The files of a replay and what is made of them.
 #[derive(Clone, Debug, Default)]

@@ -6,6 +6,12 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use clearway_daemon::config::{Calibrations, Config, Origin, Recorder, Ros};
+use clearway_daemon::ingest::ros::decoder::PoseSource;
+use clearway_daemon::record::run_config;
+use clearway_daemon::record::writer::{is_same_file, parent_of};
+use clearway_daemon::run::Setup;
+use clearway_journal::reader::RecordingReader;
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
@@ -21,18 +27,12 @@ use super::options::ReplayOptions;
 use super::overrides::overridden;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
-use crate::bag::choice::SensorTopic;
 use crate::files::ground_revolutions::{GroundRevolutions, points_of};
 use crate::files::mcap::McapOptions;
 use crate::files::{Kind, Readings};
 use crate::player::faults::Faults;
 use crate::player::timeline::{Timeline, Track};
-use clearway_daemon::config::{Calibrations, Config, Origin, Recorder, Ros};
-use clearway_daemon::ingest::ros::decoder::PoseSource;
-use clearway_daemon::record::run_config;
-use clearway_daemon::record::writer::{is_same_file, parent_of};
-use clearway_daemon::run::Setup;
-use clearway_journal::reader::RecordingReader;
+use crate::topics::choice::SensorTopic;
 
 /// What is known before the first event.
 pub(super) struct ReplayPlan {

@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use clearway_daemon::run::Running;
 use serde_json::json;
 
 use super::error::ReplayError;
-use clearway_daemon::run::Running;
 
 /// A file with the addresses of a replay, which exists while the replay can be reached.
 pub(super) struct ReadyFile(PathBuf);

@@ -3,12 +3,13 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::error::ReplayError;
-use super::options::ReplayOptions;
-use crate::files::{Kind, Readings};
 use clearway_daemon::config::{Calibrations, Config, Vehicle};
 use clearway_daemon::record::run_config;
 use clearway_journal::reader::RecordingReader;
+
+use super::error::ReplayError;
+use super::options::ReplayOptions;
+use crate::files::{Kind, Readings};
 
 /// A recording of this server.
 pub(super) struct Recorded {

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use clearway_daemon::base::counted::counted;
+use clearway_daemon::status::Snapshot;
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::map::ElevationSource;
 use clearway_mapping::pipeline::NamedStatus;
@@ -9,8 +11,6 @@ use clearway_mapping::sensor::mount::{MountError, MountEstimate};
 use serde_json::{Map, Value, json};
 
 use crate::files::Truncated;
-use clearway_daemon::base::counted::counted;
-use clearway_daemon::status::Snapshot;
 
 /// Where the extrinsics of the first sensor come from.
 #[derive(Clone, Debug, PartialEq)]

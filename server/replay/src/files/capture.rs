@@ -8,12 +8,11 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
+use clearway_daemon::base::file_advice::open_to_read;
+use clearway_daemon::ingest::queue::Reading;
 use clearway_lidar::capture::{Capture, CaptureError as Error};
 use clearway_lidar::capture_sensor::CaptureSensor;
 use clearway_mapping::event::Body;
-
-use clearway_daemon::base::file_advice::open_to_read;
-use clearway_daemon::ingest::queue::Reading;
 
 /// A capture cannot be read further.
 #[derive(Debug, thiserror::Error)]

@@ -3,10 +3,11 @@
 use std::io::{Error, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
+use clearway_daemon::base::file_advice::{advised, open_to_read};
+
 use super::capture::CaptureError;
 use super::kitti::ScanError;
 use super::mcap::McapError;
-use clearway_daemon::base::file_advice::{advised, open_to_read};
 
 /// The kind of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

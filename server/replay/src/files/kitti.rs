@@ -6,10 +6,9 @@
 
 use std::path::{Path, PathBuf};
 
+use clearway_daemon::ingest::queue::Reading;
 use clearway_mapping::event::Body;
 use clearway_mapping::scan_file::{self, ScanFileError, ScanFormat};
-
-use clearway_daemon::ingest::queue::Reading;
 
 /// Stamp of the first scan, ns since the Unix epoch: 2011-09-26 00:00:00 UTC, the day of KITTI's first drives.
 pub const EPOCH_NS: i64 = 1_316_995_200_000_000_000;

@@ -4,15 +4,16 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 
-use super::pose_gap::PoseGap;
-use super::unread_topics::unread_topics;
-use crate::bag::available::AvailableTopics;
-use crate::bag::choice::ChoiceError;
 use clearway_daemon::base::counted::counted;
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::ingest::ros::decoder::TopicDecoder;
 use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 use clearway_ros::RefusedPart;
+
+use super::pose_gap::PoseGap;
+use super::unread_topics::unread_topics;
+use crate::topics::available::AvailableTopics;
+use crate::topics::choice::ChoiceError;
 
 /// Number of refused messages that are not reported to the event queue yet, by sensor and reason.
 pub type RefusedMessages = BTreeMap<(u16, &'static str), u64>;

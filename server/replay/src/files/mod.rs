@@ -25,10 +25,10 @@ mod unread_topics;
 use std::collections::{BTreeSet, VecDeque};
 use std::path::{Path, PathBuf};
 
+use clearway_daemon::ingest::queue::Reading;
 use clearway_mapping::event::Body;
 use clearway_mapping::scan_file::ScanFormat;
 
-use clearway_daemon::ingest::queue::Reading;
 pub use kinds::{FilesError, Kind, Truncated, files_of_folder, kind, missing_parts};
 use mcap::{Before, McapOptions, RefusedMessages};
 

@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use clearway_daemon::ingest::queue::Reading;
 use clearway_mapping::event::Body;
 
-use crate::bag::available::NEAR_NS;
-use clearway_daemon::ingest::queue::Reading;
+use crate::topics::available::NEAR_NS;
 
 /// TAI is ahead of UTC by this much from 2017 on.
 const TAI_S: f64 = 37.0;

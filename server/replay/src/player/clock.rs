@@ -2,9 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use clearway_proto::v1;
-
 use clearway_journal::encode::{Replayed, lag_ns};
+use clearway_proto::v1;
 
 /// When events of recorded time are due, and how far their stamps are from the present. It starts at the first event
 /// that it is asked about. A pause stops it, also between two events; [`ReplayClock::restart`] begins elsewhere.

@@ -6,11 +6,10 @@
 
 use std::str::FromStr;
 
-use clearway_mapping::event::Body;
-use nalgebra::{Isometry3, Vector3};
-
 use clearway_daemon::base::counted::counted;
 use clearway_daemon::ingest::queue::Reading;
+use clearway_mapping::event::Body;
+use nalgebra::{Isometry3, Vector3};
 
 /// What [`Fault`] accepts, for errors and help.
 pub const SYNTAX: &str = "lost:SENSOR@FROM-TO, loss:PERCENT or loss:PERCENT@FROM-TO, clock:MS@AT, pose:X,Y,YAW@AT or \

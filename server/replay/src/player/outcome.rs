@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
+use clearway_daemon::ingest::queue::QueueClosedError;
+
 use super::timeline::Remarks;
 use crate::files::FilesError;
-use clearway_daemon::ingest::queue::QueueClosedError;
 
 /// How a replay ended.
 #[derive(Debug, Default)]

@@ -5,6 +5,9 @@
 
 use std::time::{Duration, Instant};
 
+use clearway_daemon::base::clock::now_ns;
+use clearway_daemon::base::counted::counted;
+use clearway_daemon::replay_control::{Command, ControlError, ReplayInput, check};
 use clearway_proto::v1::{self, ReplayPhase};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
@@ -15,9 +18,6 @@ use super::snapshots::{Snapshot, Snapshots};
 use super::timeline::{Ahead, Timeline};
 use super::vehicle::{ReplayedVehicle, report_refused};
 use crate::files::FilesError;
-use clearway_daemon::base::clock::now_ns;
-use clearway_daemon::base::counted::counted;
-use clearway_daemon::replay_control::{Command, ControlError, ReplayInput, check};
 
 /// Interval at which a waiting replay looks for live observations and readers. Ours: short beside a revolution.
 const POLL: Duration = Duration::from_millis(20);

@@ -8,10 +8,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, sync_channel};
 
+use clearway_daemon::ingest::queue::Reading;
+
 use super::faults::Faults;
 use crate::files::mcap::{McapOptions, RefusedMessages};
 use crate::files::{FilesError, Readings, Truncated};
-use clearway_daemon::ingest::queue::Reading;
 
 /// Readings that may be decoded ahead. Ours: 0.3 s of an HDL-64E.
 const AHEAD: usize = 1024;

@@ -3,11 +3,11 @@
 use std::sync::mpsc::Receiver;
 
 use bytes::Bytes;
+use clearway_daemon::engine::Engine;
+use clearway_daemon::ingest::queue::{EventQueue, QueuePosition, QueuedEvent};
 use clearway_mapping::pipeline::Pipeline;
 
 use crate::files::mcap::RefusedMessages;
-use clearway_daemon::engine::Engine;
-use clearway_daemon::ingest::queue::{EventQueue, QueuePosition, QueuedEvent};
 
 /// One vehicle of a replay.
 pub struct ReplayedVehicle {

@@ -1,25 +1,17 @@
 //! Topics of a ROS 2 bag -> the sensors of its vehicle, with their mounts.
-//!
-//! | file | in -> out |
-//! |---|---|
-//! | [`available`] | MCAP file -> its topics, frames and refused transforms |
-//! | [`choice`] | topics of an MCAP file -> the topics to decode |
-
-pub mod available;
-pub mod choice;
 
 use std::path::Path;
 
+use clearway_daemon::config::Ros;
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use nalgebra::Isometry3;
 
 use super::error::ReplayError;
 use super::summary::Mount;
-use crate::bag::available::AvailableTopics;
-use crate::bag::choice::{SensorTopic, TopicChoice};
 use crate::files::FilesError;
 use crate::files::mcap::{McapError, McapOptions};
-use clearway_daemon::config::Ros;
+use crate::topics::available::AvailableTopics;
+use crate::topics::choice::{SensorTopic, TopicChoice};
 
 /// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
 /// roof of a car.

@@ -5,13 +5,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
+use clearway_daemon::ingest::ros::decoder::{PoseSource, RAISED_M, TopicDecoder};
+use clearway_journal::reader::RecordingError;
 use clearway_ros::frames::local_name;
 use clearway_ros::{Frames, Kind};
 use nalgebra::{Isometry3, Translation3};
 
 use super::available::{AvailableTopics, EGO_FRAMES, Stamps, Topic, is_ego};
-use clearway_daemon::ingest::ros::decoder::{PoseSource, RAISED_M, TopicDecoder};
-use clearway_journal::reader::RecordingError;
 
 /// Plausible heights of a sensor above the ground, in metres. A transform with another height belongs to an ego frame
 /// that is not on the ground.

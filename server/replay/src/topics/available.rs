@@ -3,14 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 use clearway_ros::cdr::Reader;
 use clearway_ros::frames::{local_name, name};
 use clearway_ros::pose::{Odometry, TfMessage, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2};
 use nalgebra::Isometry3;
-
-use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// The vehicle's frame: the first of these in the tf tree, with or without a namespace. REP-120 puts `base_footprint`
 /// on the ground.
