@@ -12,8 +12,8 @@
 #   clearway.cdx.json                                what is in it (CycloneDX)
 #   SHA256SUMS                                       checksums of all these; sha256sum --check SHA256SUMS
 #
-# The binary needs no library. With BINARY none is built: that one is packed. Needs cargo, dpkg-deb, objdump and strip (binutils), python3 with
-# venv, npm.
+# The binary needs no library. With BINARY none is built: that one is packed. Needs cargo, dpkg-deb, objdump and strip
+# (binutils), python3 with venv, npm.
 set -eu
 
 mkdir -p "${1:?usage: release.sh FOLDER [BINARY]}"
