@@ -166,14 +166,13 @@ async fn after_a_stop_of_the_server_stamps_go_on_as_if_it_had_not_stopped() {
                 server.signal("-CONT");
                 let after = next_fresh(&mut maps).await;
                 late_ns = vehicle.late_ns.load(Ordering::Relaxed);
-                // The kernel has stamped the packets that waited: nothing had to be corrected, back or forth.
-                assert_eq!(after.header().epoch, last.header().epoch);
-                // Stamps of the wrong time would move by up to half a revolution.
-                let (moved_ns, allowed_ns) = (moved_ns(&last, &after), REVOLUTION_NS / 5 + 2 * late_ns);
-                assert!(
-                    late_ns > REVOLUTION_NS / 10 || moved_ns < allowed_ns,
-                    "moved by {moved_ns} of {allowed_ns} ns"
-                );
+                if late_ns <= REVOLUTION_NS / 10 {
+                    // The kernel has stamped the packets that waited: nothing had to be corrected, back or forth.
+                    assert_eq!(after.header().epoch, last.header().epoch);
+                    // Stamps of the wrong time would move by up to half a revolution.
+                    let (moved_ns, allowed_ns) = (moved_ns(&last, &after), REVOLUTION_NS / 5 + 2 * late_ns);
+                    assert!(moved_ns < allowed_ns, "moved by {moved_ns} of {allowed_ns} ns");
+                }
                 last = after;
             }
         })
