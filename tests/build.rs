@@ -45,7 +45,6 @@ const NAMESPACES: [(&str, &[&str]); 4] = [
 
 fn main() {
     println!("cargo::rerun-if-env-changed=CLEARWAY_DATA");
-    println!("cargo::rerun-if-env-changed=PATH");
     let package = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("set by cargo"));
     let repository = package.ancestors().find(|folder| folder.join("ARCHITECTURE.md").is_file());
     if let Some(repository) = repository {

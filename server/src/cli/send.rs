@@ -2,16 +2,19 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 use clap::Args;
 use clearway_tools::network::{self, Faults};
 use clearway_tools::send::{Pace, SendOptions, SendSummary, send};
 use serde_json::json;
+use tokio::runtime::Builder;
 
 use super::shared::exit::Exit;
 use super::shared::files;
-use super::shared::output::{counted, print_line, stop_flag};
+use super::shared::output::{counted, print_line, stop_signal};
 use super::tool_commands::progress_bar;
 
 /// Send the datagrams of a capture over UDP, at the recorded pace.
@@ -117,4 +120,23 @@ fn text(summary: &SendSummary, options: &SendOptions) -> String {
     lines.extend(notes.iter().cloned());
     lines.extend(cut.as_ref().map(|cut| format!("the capture is not whole: {cut}")));
     lines.join("\n")
+}
+
+/// A flag that is set at the signals of [`stop_signal`], for work that blocks.
+///
+/// # Errors
+/// As [`stop_signal`].
+pub(super) fn stop_flag() -> Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let runtime = Builder::new_current_thread().enable_all().build()?;
+    let stopped = {
+        let _entered = runtime.enter();
+        stop_signal()?
+    };
+    let of_thread = Arc::clone(&flag);
+    std::thread::spawn(move || {
+        runtime.block_on(stopped);
+        of_thread.store(true, Ordering::Relaxed);
+    });
+    Ok(flag)
 }

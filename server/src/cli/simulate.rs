@@ -10,9 +10,10 @@ use clearway_lidar::model::Model;
 use clearway_tools::scenes::{self, SCENES};
 use clearway_tools::simulate::SimulatedDrive;
 
+use super::send::stop_flag;
 use super::send::target;
 use super::shared::model::ModelParser;
-use super::shared::output::{counted, print_line, stop_flag};
+use super::shared::output::{counted, print_line};
 use super::tool_commands::progress_bar;
 
 /// The names of the scenes as the command line accepts them.

@@ -2,7 +2,7 @@
 
 use std::io::{ErrorKind, Write};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, Error, Result};
@@ -95,25 +95,6 @@ pub fn block_on<T>(work: impl Future<Output = Result<T>>) -> Result<T> {
     let threads = std::thread::available_parallelism().map_or(THREADS_MIN, usize::from).max(THREADS_MIN);
     let runtime = Builder::new_multi_thread().worker_threads(threads).enable_all().build();
     runtime.context("start the runtime")?.block_on(work)
-}
-
-/// A flag that is set at the signals of [`stop_signal`], for work that blocks.
-///
-/// # Errors
-/// As [`stop_signal`].
-pub fn stop_flag() -> Result<Arc<AtomicBool>> {
-    let flag = Arc::new(AtomicBool::new(false));
-    let runtime = Builder::new_current_thread().enable_all().build()?;
-    let stopped = {
-        let _entered = runtime.enter();
-        stop_signal()?
-    };
-    let of_thread = Arc::clone(&flag);
-    std::thread::spawn(move || {
-        runtime.block_on(stopped);
-        of_thread.store(true, Ordering::Relaxed);
-    });
-    Ok(flag)
 }
 
 /// A future that resolves at SIGINT, SIGTERM or another signal that ends programs. They are caught from this call on.
