@@ -156,7 +156,7 @@ fn systemd_finds_nothing_in_the_units_of_the_release() {
     unpacked_release(folder.path(), &root);
     let mut sums = Command::new("sha256sum");
     let sums = sums.args(["--check", "SHA256SUMS"]).current_dir(folder.path()).output().expect("it starts");
-    assert!(sums.status.success() && said(&sums).lines().count() == 6, "{}", said(&sums));
+    assert!(sums.status.success() && said(&sums).lines().count() == 7, "{}", said(&sums));
     // The units of the system to which the package comes, and the command that ExecReload names.
     let system = ["-rn", "/lib/systemd/system/."];
     succeeds(Command::new("cp").args(system).arg(root.join("lib/systemd/system")));
