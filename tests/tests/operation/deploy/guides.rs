@@ -32,7 +32,7 @@ const SENSOR: &str = "clearway simulate flat --sensor vlp16 --seconds 600 --to u
 const TLS: &str = "env CLEARWAY_CA=certificates/ca.pem CLEARWAY_CERT=certificates/reader.pem \
     CLEARWAY_KEY=certificates/reader.key";
 
-/// Runs a script in a network namespace and in this folder.
+/// Runs a script in a network namespace and in this folder. If it fails, its programs' logs say why.
 fn follow(folder: &Path, script: &str) -> String {
     symlink(workspace().join("deploy"), folder.join("deploy")).expect("a link of ours");
     fs::write(folder.join("guide.sh"), format!("{HEAD}{script}")).expect("a file of ours");
@@ -40,7 +40,8 @@ fn follow(folder: &Path, script: &str) -> String {
     let mut command = Command::new("timeout");
     command.args(["300", "unshare", "--net", "bash", "guide.sh"]).current_dir(folder).env("PATH", path);
     let output = command.output().expect("timeout");
-    assert!(output.status.success(), "{}\n{script}\n{}", output.status, said(&output));
+    let logs = || Command::new("bash").args(["-c", "tail -n 5 *.log"]).current_dir(folder).output().expect("tail");
+    assert!(output.status.success(), "{}\n{script}\n{}\n{}", output.status, said(&output), said(&logs()));
     said(&output)
 }
 
