@@ -63,7 +63,7 @@ pub async fn serve() {
     let mut config = Config::of_one_vehicle("car", "top");
     let any: SocketAddr = "127.0.0.1:0".parse().expect("an address");
     config.grpc.listen = any;
-    (config.page.enabled, config.page.listen, config.page.connections_max) = (true, any, BROWSERS_MAX);
+    (config.page.enabled, config.page.listen, config.connections.max) = (true, any, BROWSERS_MAX);
     (config.connections.per_address_max, config.connections.kept) = (BROWSERS_MAX, 0);
     (config.connections.calls_max, config.connections.calls_per_address_max) = (BROWSERS_MAX, BROWSERS_MAX);
     config.zenoh.enabled = true;

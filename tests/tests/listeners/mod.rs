@@ -55,7 +55,7 @@ async fn metric(running: &Running, line: &str) -> f64 {
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn connections_that_do_nothing_keep_no_newcomer_out() {
     let mut config = everything();
-    config.grpc.connections_max = 32;
+    config.connections.max = 32;
     config.connections.per_address_max = 24;
     let running = start(config).await;
     feed(&running, readings(2)).await;
@@ -174,7 +174,7 @@ async fn streams_that_are_never_read_are_limited_and_cost_a_healthy_reader_no_ma
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_peer_over_the_limit_is_told_so_and_known_addresses_have_places_kept_for_them() {
     let mut config = everything();
-    (config.grpc.connections_max, config.connections.kept) = (4, 2);
+    (config.connections.max, config.connections.kept) = (4, 2);
     let running = start(config.clone()).await;
     // Calls in progress, so that no connection is idle.
     let mut streams = Vec::new();
@@ -184,7 +184,7 @@ async fn a_peer_over_the_limit_is_told_so_and_known_addresses_have_places_kept_f
     }
     let refused = grpc(&running).await.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap_err();
     assert_eq!(refused.code(), tonic::Code::ResourceExhausted);
-    let text = "2 connections are open; of the 4 that grpc.connections_max allows, 2 are kept for known peers";
+    let text = "2 connections are open; of the 4 that connections.max allows, 2 are kept for known peers";
     assert_eq!(refused.message(), text);
     config.connections.known = vec!["127.0.0.1".parse().unwrap()];
     running.reload(&config, None).unwrap();
@@ -193,7 +193,7 @@ async fn a_peer_over_the_limit_is_told_so_and_known_addresses_have_places_kept_f
         streams.push(watching.unwrap().into_inner());
     }
     let refused = grpc(&running).await.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap_err();
-    assert!(refused.message().starts_with("4 connections are open, which grpc.connections_max allows"), "{refused}");
+    assert!(refused.message().starts_with("4 connections are open, which connections.max allows"), "{refused}");
     config.connections.per_address_max = 1;
     running.reload(&config, None).unwrap();
     let refused = grpc(&running).await.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap_err();

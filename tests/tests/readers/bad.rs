@@ -115,7 +115,7 @@ async fn stopped_and_slow_readers_cost_the_others_nothing_and_resume_newest() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_thousand_idle_connections_keep_no_reader_and_no_newcomer_out() {
     let mut config = config();
-    config.grpc.connections_max = 32;
+    config.connections.max = 32;
     let running = start(config).await;
     let server = running.grpc.unwrap();
     let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();

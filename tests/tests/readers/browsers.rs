@@ -183,7 +183,7 @@ const BROWSERS: usize = 250;
 async fn hundreds_of_browsers_get_every_map_and_one_too_many_is_refused_in_words() {
     let mut config = config();
     config.page.enabled = true;
-    config.page.connections_max = BROWSERS;
+    config.connections.max = BROWSERS;
     (config.connections.per_address_max, config.connections.kept) = (BROWSERS + 8, 0);
     let running = start(config).await;
     let address = running.page.unwrap();
@@ -205,7 +205,7 @@ async fn hundreds_of_browsers_get_every_map_and_one_too_many_is_refused_in_words
     }
     assert!(made >= 3);
     let refused = get(address, "/").await;
-    assert!(refused.starts_with("HTTP/1.1 503") && refused.contains("which page.connections_max allows"), "{refused}");
+    assert!(refused.starts_with("HTTP/1.1 503") && refused.contains("which connections.max allows"), "{refused}");
     // The others stay, and so does gRPC.
     browsers[0].say(r#"{"type":"watch","vehicle":"absent","id":2}"#);
     browsers[0].text_of("refused").await;

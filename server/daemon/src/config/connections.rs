@@ -10,6 +10,8 @@ use super::error::ValueError;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Connections {
+    /// Most connections at once, at each listener; further ones are refused with RESOURCE_EXHAUSTED or 503.
+    pub max: usize,
     /// Most connections of one address at once, at each listener. IPv6: of one network with a prefix of 64 bits.
     pub per_address_max: usize,
     /// Connections and calls of each listener that only known peers may use. A constant but in tests.
@@ -42,6 +44,7 @@ pub struct Connections {
 impl Default for Connections {
     fn default() -> Self {
         Self {
+            max: 256,
             per_address_max: 64,
             kept: 16,
             known: Vec::new(),
@@ -90,8 +93,10 @@ impl Service {
 
 impl Connections {
     pub(super) fn check(&self) -> Result<(), ValueError> {
-        if !(1..=65_536).contains(&self.per_address_max) {
-            return Err(ValueError::new("connections.per_address_max", self.per_address_max, "1 to 65536"));
+        for (key, value) in [("connections.max", self.max), ("connections.per_address_max", self.per_address_max)] {
+            if !(1..=65_536).contains(&value) {
+                return Err(ValueError::new(key, value, "1 to 65536"));
+            }
         }
         // The pages of an Electron program, such as Foxglove's, have the origin `file://`.
         let is_wrong = |origin: &&String| !origin.contains("://") || (origin.ends_with('/') && *origin != "file://");

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, thiserror::Error)]
 #[error("{key} = {value}: allowed: {allowed}")]
 pub(super) struct ValueError {
-    /// Path of the key, such as `grpc.connections_max`.
+    /// Path of the key, such as `grpc.advertise`.
     pub key: String,
     /// The value that was found.
     pub value: String,

@@ -23,8 +23,6 @@ pub struct Grpc {
     /// The host, with or without a port, at which other machines reach `listen`: other servers lead readers there.
     /// Empty: the address of `listen` itself, unless it is a wildcard or of this host alone.
     pub advertise: String,
-    /// Most connections at once; further ones are refused with RESOURCE_EXHAUSTED.
-    pub connections_max: usize,
     /// Certificates; without them gRPC is plain text.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls: Option<Tls>,
@@ -35,14 +33,7 @@ pub struct Grpc {
 impl Default for Grpc {
     fn default() -> Self {
         let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 50051);
-        Self {
-            enabled: true,
-            listen,
-            advertise: String::new(),
-            connections_max: 256,
-            tls: None,
-            access: Access::default(),
-        }
+        Self { enabled: true, listen, advertise: String::new(), tls: None, access: Access::default() }
     }
 }
 
@@ -123,9 +114,6 @@ impl Grpc {
         if !Self::is_address(&self.advertise) {
             let allowed = "a host such as \"vehicle-7.example\", or host and port such as \"10.0.0.7:50051\"";
             return Err(ValueError::new("grpc.advertise", &self.advertise, allowed));
-        }
-        if !(1..=65_536).contains(&self.connections_max) {
-            return Err(ValueError::new("grpc.connections_max", self.connections_max, "1 to 65536 connections"));
         }
         Ok(())
     }

@@ -102,14 +102,12 @@ pub struct Page {
     pub listen: SocketAddr,
     /// URL at which others reach the page, for pages of other servers; empty: they show its vehicles without a link.
     pub advertise: String,
-    /// Most connections at once; further ones are refused with 503.
-    pub connections_max: usize,
 }
 
 impl Default for Page {
     fn default() -> Self {
         let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8080);
-        Self { enabled: true, listen, advertise: String::new(), connections_max: 256 }
+        Self { enabled: true, listen, advertise: String::new() }
     }
 }
 
@@ -122,9 +120,6 @@ impl Page {
     fn check(&self) -> Result<(), ValueError> {
         if !self.advertise.is_empty() && !Self::is_url(&self.advertise) {
             return Err(ValueError::new("page.advertise", &self.advertise, "http://HOST:PORT/ or https://HOST:PORT/"));
-        }
-        if !(1..=65_536).contains(&self.connections_max) {
-            return Err(ValueError::new("page.connections_max", self.connections_max, "1 to 65536 connections"));
         }
         Ok(())
     }
@@ -305,7 +300,7 @@ impl Config {
         self.grpc.check()?;
         self.page.check()?;
         self.connections.check()?;
-        self.recorder.check(self.vehicles.iter().any(|vehicle| vehicle.maps.memory.enabled))?;
+        self.recorder.check()?;
         self.store.check()?;
         self.traces.check()?;
         self.zenoh.check(&self.vehicles)?;
@@ -393,8 +388,6 @@ impl Config {
     pub fn without_reloaded(mut self, old: &Self) -> Self {
         self.grpc.tls.clone_from(&old.grpc.tls);
         self.grpc.access.clone_from(&old.grpc.access);
-        self.grpc.connections_max = old.grpc.connections_max;
-        self.page.connections_max = old.page.connections_max;
         self.connections.clone_from(&old.connections);
         self
     }

@@ -187,7 +187,6 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         ("[[vehicle]]", "[store]\nurl = \"ftp://a/b\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
         ("[[vehicle]]", "[store]\nurl = \"s3:///prefix\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
         ("[[vehicle]]", "[store]\nurl = \"file://mnt\"\n[[vehicle]]", "file:///FOLDER"),
-        ("[[vehicle]]", "[recorder]\nfile = \"a\"\nwarm_up_ms = 500\n[[vehicle]]", "at least the 5 s"),
     ];
     for (from, to, allowed) in wrong {
         let error = error(&NEEDED.replacen(from, to, 1));
@@ -383,7 +382,7 @@ fn an_address_that_other_hosts_can_reach_needs_protection_or_its_name_in_words()
 fn a_reload_changes_certificates_roles_and_limits_and_nothing_else() {
     let config = |option: &str| Config::parse(NEEDED, Path::new("a.toml"), &[option.to_owned()]).unwrap();
     let old = config("grpc.enabled=true");
-    for reloaded in ["grpc.connections_max=7", "page.connections_max=7", "connections.hosts=[\"car.example\"]"] {
+    for reloaded in ["connections.max=7", "connections.per_address_max=7", "connections.hosts=[\"car.example\"]"] {
         assert_eq!(config(reloaded).without_reloaded(&old), old, "{reloaded}");
     }
     for fixed in ["grpc.listen=127.0.0.1:7", "zenoh.enabled=false"] {

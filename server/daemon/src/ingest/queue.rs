@@ -9,7 +9,7 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 
 use clearway_mapping::event::{Body, Cause, Event};
@@ -135,7 +135,7 @@ pub struct EventQueue {
 #[derive(Debug)]
 struct State {
     /// `None` once the queue is closed.
-    sender: Option<SyncSender<QueuedEvent>>,
+    sender: Option<Sender<QueuedEvent>>,
     next_sequence: u64,
     /// Arrival of the newest report of drops, ns since the Unix epoch.
     reported_ns: i64,
@@ -172,7 +172,7 @@ pub fn event_queue(capacity: usize) -> (EventQueue, Receiver<QueuedEvent>) {
 
 /// Creates a queue of `capacity` events that stamps live readings with `clock`.
 pub fn event_queue_with_clock(clock: Clock, capacity: usize) -> (EventQueue, Receiver<QueuedEvent>) {
-    let (sender, events) = sync_channel(capacity);
+    let (sender, events) = channel();
     let state = State { sender: Some(sender), next_sequence: 0, reported_ns: 0, newest_ns: None };
     let (state, space) = (Arc::new(Mutex::new(state)), Arc::new(Semaphore::new(capacity)));
     (EventQueue { state, space, capacity, shares: None, drops: Arc::default(), clock }, events)

@@ -128,8 +128,11 @@ const CONSTANTS: [(&str, &str, &str); 67] = [
 ];
 
 /// Keys of other tables that earlier versions had. They changed no map that is computed again.
-const REMOVED: [(&str, &str); 9] = [
+const REMOVED: [(&str, &str); 12] = [
     ("recorder", "queue"),
+    ("recorder", "warm_up_ms"),
+    ("grpc", "connections_max"),
+    ("page", "connections_max"),
     ("connections", "kept"),
     ("connections", "calls_max"),
     ("connections", "calls_per_address_max"),

@@ -9,12 +9,7 @@ use crate::base::held_sockets::HeldSockets;
 use crate::config::Config;
 use crate::publish::foxglove;
 use crate::publish::listen::security::Security;
-use crate::publish::listen::{AllSlots, Listener, ListenerHandle, ListenerLimits, Protocol};
-
-/// Most connections of Foxglove. Ours: some dozens of people with a few connections each.
-const FOXGLOVE_CONNECTIONS_MAX: usize = 256;
-/// Most connections of the metrics. Ours: some probes and collectors.
-const METRICS_CONNECTIONS_MAX: usize = 64;
+use crate::publish::listen::{AllSlots, Listener, ListenerHandle, Protocol};
 
 /// The TCP listeners.
 pub(super) struct Listeners {
@@ -79,19 +74,8 @@ impl Listeners {
         };
         let socket = socket.inspect_err(refuse).ok()?;
         let (listener, handle) =
-            Listener::new(socket, protocol, limits(name, config), self.security.clone(), &self.all);
+            Listener::new(socket, protocol, config.connections.clone(), self.security.clone(), &self.all);
         self.handles.push((name, handle));
         Some(listener)
     }
-}
-
-/// The limits of the listener with this name.
-pub(super) fn limits(name: &str, config: &Config) -> ListenerLimits {
-    let (connections_max, allowed_by) = match name {
-        "grpc" => (config.grpc.connections_max, "grpc.connections_max"),
-        "metrics" => (METRICS_CONNECTIONS_MAX, "the metrics' listener"),
-        "page" => (config.page.connections_max, "page.connections_max"),
-        _ => (FOXGLOVE_CONNECTIONS_MAX, "Foxglove's listener"),
-    };
-    ListenerLimits { connections_max, allowed_by, every: config.connections.clone() }
 }

@@ -10,7 +10,6 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use super::input::VehicleInput;
-use super::listeners::limits;
 use super::setup::ShutdownError;
 use crate::base::sync::locked;
 use crate::config::{Certificates, Config};
@@ -132,8 +131,8 @@ impl Running {
             return Err("TLS begins or ends only with a restart".into());
         }
         security.replace(next.clone());
-        for (name, handle) in handles {
-            handle.set_limits(limits(name, config));
+        for (_, handle) in handles {
+            handle.set_limits(config.connections.clone());
             handle.recheck(&next);
         }
         Ok(())

@@ -45,12 +45,13 @@ use tonic::Status;
 use tower_service::Service;
 
 use crate::base::sync::locked;
+use crate::config::Connections;
 use crate::status::ListenerCounts;
 use access::Caller;
 use security::Security;
 use slots::{Authorization, ConnectionSlots};
 
-pub use slots::{CallPermit, ConnectionSlot, ListenerLimits};
+pub use slots::{CallPermit, ConnectionSlot};
 
 /// Pause after an error of the listener itself, such as no free file handle: to try again at once would only use a
 /// core.
@@ -124,7 +125,7 @@ impl ListenerHandle {
     }
 
     /// Uses other limits from now on; open connections stay.
-    pub fn set_limits(&self, limits: ListenerLimits) {
+    pub fn set_limits(&self, limits: Connections) {
         self.0.slots.set_limits(limits);
     }
 
@@ -152,7 +153,7 @@ impl Listener {
     pub fn new(
         socket: TcpListener,
         protocol: Protocol,
-        limits: ListenerLimits,
+        limits: Connections,
         security: Security,
         all: &AllSlots,
     ) -> (Self, ListenerHandle) {

@@ -14,34 +14,21 @@ use tokio_util::sync::CancellationToken;
 use super::access::Caller;
 use crate::base::clock::now_ns;
 use crate::base::sync::locked;
-use crate::config;
+use crate::config::Connections;
 
 /// Longest time from the connection to its first request, with the TLS handshake. Ours: every client sends at once.
 const FIRST_REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Most connections over the limit that are open at once to receive an error; others get none. Ours: few file handles.
 const REFUSED_MAX: usize = 16;
 
-/// The limits of one listener.
-#[derive(Clone, Debug)]
-pub struct ListenerLimits {
-    /// Most connections.
-    pub connections_max: usize,
-    /// The key or the listener that sets `connections_max`, for errors.
-    pub allowed_by: &'static str,
-    /// The limits of every listener.
-    pub every: config::Connections,
+/// Connections that only known peers may use: at least half of all are for every peer.
+fn kept_connections(limits: &Connections) -> usize {
+    limits.kept.min(limits.max / 2)
 }
 
-impl ListenerLimits {
-    /// Connections that only known peers may use: at least half of all are for every peer.
-    fn kept(&self) -> usize {
-        self.every.kept.min(self.connections_max / 2)
-    }
-
-    /// Calls that only known peers may have in progress: at least half of all are for every peer.
-    fn kept_calls(&self) -> usize {
-        self.kept().min(self.every.calls_max / 2)
-    }
+/// Calls that only known peers may have in progress: at least half of all are for every peer.
+fn kept_calls(limits: &Connections) -> usize {
+    kept_connections(limits).min(limits.calls_max / 2)
 }
 
 /// The address that limits count: an IPv4 address, or a network of IPv6 with a prefix of 64 bits, because a host may
@@ -59,7 +46,7 @@ pub struct ConnectionSlots(Mutex<Slots>);
 
 #[derive(Debug)]
 struct Slots {
-    limits: ListenerLimits,
+    limits: Connections,
     open: BTreeMap<u64, OpenConnection>,
     /// Number of connections and calls so far, which numbers them.
     count: u64,
@@ -127,13 +114,13 @@ impl Slots {
     /// # Errors
     /// What is exhausted, as a text.
     fn make_room(&mut self, peer: IpAddr, is_known: bool) -> Result<(), String> {
-        let (address, every) = (counted_address(peer), &self.limits.every);
+        let (address, limits) = (counted_address(peer), &self.limits);
         let open =
             |of: &dyn Fn(&OpenConnection) -> bool| self.open.values().filter(|c| c.is_counted() && of(c)).count();
         let (all, unknown) = (open(&|_| true), open(&|connection| !connection.is_known));
         let of_address = open(&|connection| connection.address == address);
-        let (most, by, kept) = (self.limits.connections_max, self.limits.allowed_by, self.limits.kept());
-        if of_address >= every.per_address_max && !self.close_idlest(|connection| connection.address == address) {
+        let (most, kept) = (limits.max, kept_connections(limits));
+        if of_address >= limits.per_address_max && !self.close_idlest(|connection| connection.address == address) {
             return Err(format!(
                 "{of_address} connections of {peer} are open, which connections.per_address_max allows"
             ));
@@ -141,9 +128,12 @@ impl Slots {
         let is_full = all >= most || (!is_known && unknown >= most - kept);
         if is_full && !self.close_idlest(|connection| is_known || !connection.is_known) {
             return Err(match all >= most {
-                true => format!("{most} connections are open, which {by} allows; try again when one is closed"),
+                true => {
+                    format!("{most} connections are open, which connections.max allows; try again when one is closed")
+                }
                 false => format!(
-                    "{unknown} connections are open; of the {most} that {by} allows, {kept} are kept for known peers"
+                    "{unknown} connections are open; of the {most} that connections.max allows, {kept} are kept for known \
+                     peers"
                 ),
             });
         }
@@ -175,13 +165,13 @@ impl Slots {
 
 impl ConnectionSlots {
     /// The slots of a listener without a connection.
-    pub fn new(limits: ListenerLimits) -> Arc<Self> {
+    pub fn new(limits: Connections) -> Arc<Self> {
         let (open, closed) = (BTreeMap::new(), BTreeMap::new());
         Arc::new(Self(Mutex::new(Slots { limits, open, count: 0, closed, heartbeat: None })))
     }
 
     /// Uses other limits from now on; open connections stay.
-    pub fn set_limits(&self, limits: ListenerLimits) {
+    pub fn set_limits(&self, limits: Connections) {
         locked(&self.0).limits = limits;
     }
 
@@ -203,7 +193,7 @@ impl ConnectionSlots {
 
     /// Longest time in which a peer takes no byte of what is sent to it.
     pub fn stalled_max(&self) -> Duration {
-        Duration::from_secs(locked(&self.0).limits.every.stalled_s)
+        Duration::from_secs(locked(&self.0).limits.stalled_s)
     }
 
     /// Closes the connections with a call that was allowed and no longer is.
@@ -221,7 +211,7 @@ impl ConnectionSlots {
     pub fn sweep(&self) {
         let (mut slots, now) = (locked(&self.0), Instant::now());
         slots.heartbeat = Some(now);
-        let idle = Duration::from_secs(slots.limits.every.idle_s);
+        let idle = Duration::from_secs(slots.limits.idle_s);
         slots.close(|connection| connection.fault(idle, now));
     }
 
@@ -229,7 +219,7 @@ impl ConnectionSlots {
     /// these there are a few.
     pub fn admit(self: &Arc<Self>, peer: IpAddr) -> ConnectionSlot {
         let (mut slots, now) = (locked(&self.0), Instant::now());
-        let is_known = slots.limits.every.known.contains(&peer);
+        let is_known = slots.limits.known.contains(&peer);
         let refusal = slots.make_room(peer, is_known).err();
         if refusal.is_some() {
             let refused = slots.open.values().filter(|c| c.refusal.is_some() && !c.closing.is_cancelled());
@@ -320,8 +310,8 @@ impl ConnectionSlot {
         };
         let (all, of_address) = (calls(&|_| true), calls(&|connection| connection.address == address));
         let (limits, is_known) = (&slots.limits, slots.open.get(&self.number)?.is_known);
-        let calls_max = limits.every.calls_max - if is_known { 0 } else { limits.kept_calls() };
-        if all >= calls_max || of_address >= limits.every.calls_per_address_max {
+        let calls_max = limits.calls_max - if is_known { 0 } else { kept_calls(limits) };
+        if all >= calls_max || of_address >= limits.calls_per_address_max {
             return None;
         }
         let number = slots.next_number();
@@ -357,8 +347,8 @@ impl Drop for CallPermit {
 mod tests {
     use super::*;
 
-    fn slots(every: config::Connections) -> Arc<ConnectionSlots> {
-        ConnectionSlots::new(ListenerLimits { connections_max: 100, allowed_by: "the test", every })
+    fn slots(limits: Connections) -> Arc<ConnectionSlots> {
+        ConnectionSlots::new(limits)
     }
 
     fn begin(slot: &Arc<ConnectionSlot>) -> Option<CallPermit> {
@@ -368,8 +358,7 @@ mod tests {
 
     #[test]
     fn a_host_with_a_network_of_ipv6_counts_as_one_address() {
-        let every = config::Connections { per_address_max: 2, calls_per_address_max: 2, ..Default::default() };
-        let slots = slots(every);
+        let slots = slots(Connections { per_address_max: 2, calls_per_address_max: 2, ..Default::default() });
         let of = |address: &str| Arc::new(slots.admit(address.parse().unwrap()));
         let held = ["2001:db8::1", "2001:db8::2"].map(|address| begin(&of(address)).expect("a call"));
         let third = of("2001:db8::ffff:3");
@@ -382,7 +371,7 @@ mod tests {
 
     #[test]
     fn the_last_calls_are_for_known_peers() {
-        let slots = slots(config::Connections { calls_max: 4, kept: 9, ..Default::default() });
+        let slots = slots(Connections { calls_max: 4, kept: 9, ..Default::default() });
         let peer = |last: u8, is_known: bool| {
             let slot = Arc::new(slots.admit([127, 0, 0, last].into()));
             if is_known {

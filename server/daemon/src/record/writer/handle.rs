@@ -7,13 +7,13 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
 
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::VehicleConfig;
 use clearway_mapping::event::{Body, Event};
 use clearway_mapping::pipeline::{Handover, Pipeline};
+use flume::{Receiver, Sender, TrySendError};
 
 use super::counts::RecorderCounts;
 use crate::config::Recorder as Options;
@@ -64,7 +64,7 @@ pub(super) struct Link {
 
 /// The queue of a recording, with a handle for each vehicle of the header. What the handles send belongs to part 1.
 pub(super) fn link(options: &Options, header: &Header, waits: bool) -> (Link, Vec<RecordingHandle>) {
-    let (queue, items) = sync_channel(options.queue);
+    let (queue, items) = flume::bounded(options.queue);
     let mut header = header.clone();
     if options.maps == RecordedMaps::None {
         header.vehicles.iter_mut().for_each(|(_, layers)| layers.clear());
@@ -89,7 +89,7 @@ struct WarmUp {
 /// One vehicle's handle of the recording: sends its events and maps to the recorder's queue.
 pub struct RecordingHandle {
     vehicle: usize,
-    queue: SyncSender<Item>,
+    queue: Sender<Item>,
     counts: Arc<RecorderCounts>,
     waits: bool,
     wanted: WantedPart,
@@ -112,7 +112,7 @@ pub struct RecordingHandle {
 impl RecordingHandle {
     pub(super) fn new(
         vehicle: usize,
-        queue: SyncSender<Item>,
+        queue: Sender<Item>,
         counts: Arc<RecorderCounts>,
         waits: bool,
         wanted: WantedPart,

@@ -7,11 +7,11 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant, SystemTime};
 
 use clearway_mapping::event::Event;
 use clearway_proto::v1;
+use flume::{Receiver, RecvTimeoutError};
 use mcap::McapError;
 
 use super::control::{Command, Request};
