@@ -169,6 +169,18 @@ fn questions(numbers: &mut Numbers) -> Vec<Value> {
         asked.push(json!({ "ask": "along", "layer": "squares", "arc": arc, "outline": outline }));
     }
     asked.push(json!({ "ask": "along", "layer": "squares", "places": [[1, 1], [1, 1]], "outline": [1, 1, 1] }));
+    // Turns that move a corner much farther than the reference point.
+    for layer in ["squares", "rings"] {
+        for _ in 0..30 {
+            let (front, rear, width) =
+                (numbers.between(0.2, 2.0), numbers.between(0.0, 0.5), numbers.between(0.1, 0.5));
+            let arc = [numbers.between(-20.0, 20.0), numbers.between(-0.5, 0.5)];
+            asked.push(json!({ "ask": "along", "layer": layer, "arc": arc, "outline": [front, rear, width] }));
+            let [from, by] = [numbers.point(1.5), numbers.point(1.5)];
+            let places = [from, by, numbers.point(1.5), by];
+            asked.push(json!({ "ask": "along", "layer": layer, "places": places, "outline": [front, rear, width] }));
+        }
+    }
     asked.push(json!({ "ask": "nearest_obstacle", "layer": "squares", "point": [0, "NaN"], "own": null }));
     asked.push(json!({ "ask": "nearest_low", "layer": "squares", "point": [0, 0], "own": [1, "inf", 1] }));
     asked.push(json!({ "ask": "clearance", "layer": "squares", "most_m": -1, "passes_low": false }));
@@ -271,6 +283,53 @@ fn the_golden_questions_have_the_golden_answers() {
     for question in questions {
         let found = answer(&view, question);
         assert!(is_same(&found, &question["answer"]), "{question}: {found}");
+    }
+}
+
+/// A map of free squares of 0.25 m and one occupied one, with its centre at a place.
+fn free_but_at([x_m, y_m]: [f64; 2]) -> MapView {
+    let (origin_x_m, origin_y_m, width, height, cell_m) = (-8.0, -8.0, 64, 64, 0.25);
+    let mut cells = [1_u8; 4096];
+    cells[((y_m + 8.0) / 0.25) as usize * 64 + ((x_m + 8.0) / 0.25) as usize] = 3;
+    let grid = v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, ..Default::default() };
+    let mut layer = v1::Layer {
+        name: "squares".into(),
+        geometry: Some(Geometry::Cartesian(grid)),
+        channels: vec![encode_grid(CellsRef::U8(&cells), 64).into_channel("class", "", 1.0, 0)],
+        ..Default::default()
+    };
+    encode_legend(&mut layer, LEGEND);
+    let mut encoded = encode_header(&v1::Header::default()).to_vec();
+    encoded.extend_from_slice(&encode_layer(&layer));
+    MapView::decode(encoded.into()).unwrap()
+}
+
+#[test]
+fn a_vehicle_that_turns_meets_every_cell_over_which_its_front_sweeps() {
+    let outline = Outline { front_m: 3.0, rear_m: 0.5, width_m: 0.5 };
+    let meets = |path: &Path, heading_rad: f64, place: [f64; 2]| {
+        let (sin, cos) = heading_rad.sin_cos();
+        let front = [place[0] + 2.99 * cos, place[1] + 2.99 * sin];
+        let met = free_but_at(front).along("squares", path, &outline).unwrap();
+        assert!(met.blocked.is_some(), "{path:?}: nothing at {front:?}, heading {heading_rad}");
+    };
+    for radius_m in [2.0, 0.5, 0.2, 0.1, 0.05] {
+        let path = Path::Arc { curvature_per_m: 1.0 / radius_m, length_m: radius_m * std::f64::consts::PI };
+        for degrees in 0..=180 {
+            let heading_rad = f64::from(degrees).to_radians();
+            meets(&path, heading_rad, [radius_m * heading_rad.sin(), radius_m * (1.0 - heading_rad.cos())]);
+        }
+    }
+    let back = Path::Places(vec![[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]);
+    (0..=180).for_each(|degrees| meets(&back, f64::from(degrees).to_radians(), [1.0, 0.0]));
+    let right = Path::Places(vec![[0.0, 0.0], [1.0, 0.0], [1.0, -1.0]]);
+    (0..=90).for_each(|degrees| meets(&right, -f64::from(degrees).to_radians(), [1.0, 0.0]));
+    for (path, value) in [
+        (Path::Arc { curvature_per_m: 1e308, length_m: 20.0 }, "inf"),
+        (Path::Arc { curvature_per_m: 1e3, length_m: 20.0 }, "60207."),
+    ] {
+        let error = free_but_at([0.0, 0.0]).along("squares", &path, &outline).unwrap_err().to_string();
+        assert!(error.starts_with(&format!("the turn of the farthest corner is {value}")), "{path:?}: {error}");
     }
 }
 

@@ -90,7 +90,7 @@ class Asked:
 
     def along(self, path: Arc | Sequence[Point], outline: Outline) -> Along:
         outline.check()
-        poses = poses_of(path)
+        poses = poses_of(path, outline)
         low: tuple[float, Blocker] | None = None
         for pose, is_free in zip(poses, self._surely_free(poses, outline)):
             if is_free:
@@ -210,6 +210,9 @@ def touched(grid: Grid, corners: list[Point]) -> tuple[np.ndarray, Point | None]
     """The cells that a simple polygon touches, ascending, and its first corner outside the grid or on the grid's
     border; `None` if it lies inside. A cell is touched by an edge, or lies wholly inside; then the line through its
     centre crosses the polygon there."""
+    far = next((corner for corner in corners if not all(map(math.isfinite, corner))), None)
+    if far is not None:
+        return np.empty(0, np.int64), far
     if isinstance(grid, CartesianGrid):
         cells, is_outside = _touched_squares(grid, np.array(corners))
     else:

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 from .errors import ClearwayError
 
-#: Most corners of a polygon and places of a path, longest path, and greatest distance between two judged poses.
+#: Most corners of a polygon and places of a path, longest path, greatest distance between two judged poses, and
+#: greatest way of the farthest corner by turning between them.
 _CORNERS_MAX = 1_000
 _PATH_M_MAX = 1_000.0
 _STEP_M = 0.1
@@ -38,6 +39,10 @@ class Outline:
         left = self.width_m / 2.0
         corners = [(self.front_m, -left), (self.front_m, left), (-self.rear_m, left), (-self.rear_m, -left)]
         return [(x + ahead * cos - side * sin, y + ahead * sin + side * cos) for ahead, side in corners]
+
+    def reach_m(self) -> float:
+        """Distance of the farthest corner from the reference point, in metres."""
+        return math.hypot(max(self.front_m, self.rear_m), self.width_m / 2.0)
 
     def check(self) -> None:
         for name in ("front_m", "rear_m", "width_m"):
@@ -70,9 +75,12 @@ def corners_of(polygon: Sequence[Point]) -> list[Point]:
     return corners
 
 
-def poses_of(path: Arc | Sequence[Point]) -> list[Pose]:
-    """Poses at most 0.1 m apart, with both ends; each corner of a path occurs with both headings."""
-    return _arc_poses(path) if isinstance(path, Arc) else _straight_poses(path)
+def poses_of(path: Arc | Sequence[Point], outline: Outline) -> list[Pose]:
+    """Poses of a vehicle, each at most 0.1 m from the one before and turned by so little that its farthest corner moves
+    at most as far by that; with both ends. At a place between two stretches the vehicle turns the shorter way, to the
+    left if both are equal."""
+    make = _arc_poses if isinstance(path, Arc) else _straight_poses
+    return make(path, outline.reach_m())
 
 
 def finite(what: str, value: float) -> float:
@@ -87,25 +95,30 @@ def length(what: str, value: float) -> float:
     return float(value)
 
 
-def _straight_poses(given: Sequence[Point]) -> list[Pose]:
+def _straight_poses(given: Sequence[Point], reach_m: float) -> list[Pose]:
     places = _places("path", given, "place", 2)
     poses: list[Pose] = []
     before_m = 0.0
     for (ax, ay), (bx, by) in zip(places, places[1:]):
         dx, dy = bx - ax, by - ay
         stretch_m, heading_rad = math.hypot(dx, dy), math.atan2(dy, dx)
-        _path_length(before_m + stretch_m)
-        steps = max(1, math.ceil(stretch_m / _STEP_M))
+        _path_length("the path", before_m + stretch_m)
+        if poses:
+            along_m, place, before_rad = poses[-1]
+            turn_rad = _shorter_turn(before_rad, heading_rad)
+            steps = _steps(_turn_m(turn_rad, reach_m))
+            poses += [Pose(along_m, place, before_rad + step / steps * turn_rad) for step in range(1, steps)]
+        steps = _steps(stretch_m)
         for share in (step / steps for step in range(steps + 1)):
             poses.append(Pose(before_m + share * stretch_m, (ax + share * dx, ay + share * dy), heading_rad))
         before_m += stretch_m
     return poses
 
 
-def _arc_poses(arc: Arc) -> list[Pose]:
+def _arc_poses(arc: Arc, reach_m: float) -> list[Pose]:
     curvature, whole_m = finite("curvature_per_m", arc.curvature_per_m), finite("length_m", arc.length_m)
-    _path_length(abs(whole_m))
-    steps = max(1, math.ceil(abs(whole_m) / _STEP_M))
+    _path_length("the path", abs(whole_m))
+    steps = _steps(max(abs(whole_m), _turn_m(curvature * whole_m, reach_m)))
     poses = []
     for step in range(steps + 1):
         along_m = step / steps * whole_m
@@ -117,9 +130,30 @@ def _arc_poses(arc: Arc) -> list[Pose]:
     return poses
 
 
-def _path_length(value: float) -> None:
-    if value > _PATH_M_MAX:
-        raise ClearwayError("length", f"the path is {value} m; 0 to 1000 m is allowed")
+def _steps(way_m: float) -> int:
+    """Steps of at most 0.1 m on a way."""
+    return max(1, math.ceil(way_m / _STEP_M))
+
+
+def _shorter_turn(from_rad: float, to_rad: float) -> float:
+    """The turn from one heading to another, in radians, positive to the left."""
+    turn_rad = to_rad - from_rad
+    if turn_rad > math.pi:
+        return turn_rad - math.tau
+    return turn_rad + math.tau if turn_rad <= -math.pi else turn_rad
+
+
+def _turn_m(turn_rad: float, reach_m: float) -> float:
+    """The way of the farthest corner by a turn, in metres."""
+    way_m = abs(turn_rad) * reach_m
+    _path_length("the turn of the farthest corner", way_m)
+    return way_m
+
+
+def _path_length(what: str, value: float) -> None:
+    """Checks the length of a way. A length that is not a number is too long."""
+    if not value <= _PATH_M_MAX:
+        raise ClearwayError("length", f"{what} is {value} m; 0 to 1000 m is allowed")
 
 
 def _places(what: str, given: Sequence[Point], one: str, least: int) -> list[Point]:

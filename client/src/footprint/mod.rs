@@ -104,7 +104,8 @@ impl MapView {
         Ok(answer(layer, &kinds(layer), &area.checked_corners()?, [0.0; 2]))
     }
 
-    /// What a vehicle of this outline meets on a path. The path is judged at poses at most 0.1 m apart.
+    /// What a vehicle of this outline meets on a path. The path is judged at poses at most 0.1 m apart, between which
+    /// no corner of the vehicle moves farther than that by turning.
     ///
     /// # Errors
     /// [`ClientError::NoLayer`] if the map does not have the layer, [`ClientError::Shape`] if a value of the path or
@@ -113,7 +114,7 @@ impl MapView {
         let layer = self.layer(layer)?;
         let kinds = kinds(layer);
         outline.check()?;
-        let poses = path.poses()?;
+        let poses = path.poses(outline)?;
         let mut met = Along { length_m: poses.last().map_or(0.0, |pose| pose.along_m), low: None, blocked: None };
         for pose in poses {
             match answer(layer, &kinds, &outline.at(pose.place, pose.heading_rad), pose.place) {

@@ -3,7 +3,7 @@
 //! In: values in the ego frame (x forward, y left, metres, radians). Out: checked corners and poses. A value that is
 //! not finite, or a polygon that crosses itself, is an error with that value, and never an answer.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
 use super::touched::edges;
 
@@ -11,7 +11,8 @@ use super::touched::edges;
 const CORNERS_MAX: usize = 1_000;
 /// Longest path, in metres. Ours: far beyond any map.
 const PATH_M_MAX: f64 = 1_000.0;
-/// Greatest distance between two poses at which a path is judged, in metres. Ours: less than half a cell.
+/// Greatest distance between two poses at which a path is judged, in metres, and greatest way of the farthest corner
+/// by turning between them. Ours: less than half a cell.
 const STEP_M: f64 = 0.1;
 
 /// Why a shape cannot be judged.
@@ -155,6 +156,11 @@ impl Outline {
             .map(|(ahead, left)| [x + ahead * cos - left * sin, y + ahead * sin + left * cos])
     }
 
+    /// Distance of the farthest corner from the reference point, in metres.
+    fn reach_m(&self) -> f64 {
+        self.front_m.max(self.rear_m).hypot(self.width_m / 2.0)
+    }
+
     pub(super) fn check(&self) -> Result<(), ShapeError> {
         length("front_m", self.front_m)?;
         length("rear_m", self.rear_m)?;
@@ -165,7 +171,8 @@ impl Outline {
 /// A way of the vehicle's reference point.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Path {
-    /// Straight from place to place (x, y in metres); the vehicle heads along each stretch.
+    /// Straight from place to place (x, y in metres); the vehicle heads along each stretch, and turns at the place
+    /// between two of them the shorter way, to the left if both are equal.
     Places(Vec<[f64; 2]>),
     /// An arc of constant curvature from the ego origin, straight ahead at its beginning.
     Arc {
@@ -186,24 +193,33 @@ pub(super) struct PathPose {
 }
 
 impl Path {
-    /// Poses at most [`STEP_M`] apart, with both ends; each corner occurs with both headings.
-    pub(super) fn poses(&self) -> Result<Vec<PathPose>, ShapeError> {
+    /// Poses of a vehicle, each at most [`STEP_M`] from the one before and turned by so little that its farthest corner
+    /// moves at most as far by that; with both ends.
+    pub(super) fn poses(&self, outline: &Outline) -> Result<Vec<PathPose>, ShapeError> {
         match self {
-            Self::Places(given) => straight_poses(given),
-            Self::Arc { curvature_per_m, length_m } => arc_poses(*curvature_per_m, *length_m),
+            Self::Places(given) => straight_poses(given, outline.reach_m()),
+            Self::Arc { curvature_per_m, length_m } => arc_poses(*curvature_per_m, *length_m, outline.reach_m()),
         }
     }
 }
 
-fn straight_poses(given: &[[f64; 2]]) -> Result<Vec<PathPose>, ShapeError> {
+fn straight_poses(given: &[[f64; 2]], reach_m: f64) -> Result<Vec<PathPose>, ShapeError> {
     let places = places("path", given, "place", 2)?;
-    let (mut poses, mut before_m) = (Vec::new(), 0.0);
+    let (mut poses, mut before_m) = (Vec::<PathPose>::new(), 0.0);
     for pair in places.windows(2) {
         let [from, to] = [pair[0], pair[1]];
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
         let (stretch_m, heading_rad) = (dx.hypot(dy), dy.atan2(dx));
-        path_length(before_m + stretch_m)?;
-        let steps = (stretch_m / STEP_M).ceil().max(1.0) as u32;
+        path_length("the path", before_m + stretch_m)?;
+        if let Some(before) = poses.last().copied() {
+            let turn_rad = shorter_turn(before.heading_rad, heading_rad);
+            let steps = steps(turn_m(turn_rad, reach_m)?);
+            poses.extend((1..steps).map(|step| {
+                let turned_rad = f64::from(step) / f64::from(steps) * turn_rad;
+                PathPose { heading_rad: before.heading_rad + turned_rad, ..before }
+            }));
+        }
+        let steps = steps(stretch_m);
         poses.extend((0..=steps).map(|step| {
             let share = f64::from(step) / f64::from(steps);
             let place = [from[0] + share * dx, from[1] + share * dy];
@@ -214,11 +230,11 @@ fn straight_poses(given: &[[f64; 2]]) -> Result<Vec<PathPose>, ShapeError> {
     Ok(poses)
 }
 
-fn arc_poses(curvature_per_m: f64, length_m: f64) -> Result<Vec<PathPose>, ShapeError> {
+fn arc_poses(curvature_per_m: f64, length_m: f64, reach_m: f64) -> Result<Vec<PathPose>, ShapeError> {
     finite(|| "curvature_per_m".into(), curvature_per_m)?;
     finite(|| "length_m".into(), length_m)?;
-    path_length(length_m.abs())?;
-    let steps = (length_m.abs() / STEP_M).ceil().max(1.0) as u32;
+    path_length("the path", length_m.abs())?;
+    let steps = steps(length_m.abs().max(turn_m(curvature_per_m * length_m, reach_m)?));
     let pose = |step: u32| {
         let along_m = f64::from(step) / f64::from(steps) * length_m;
         let heading_rad = curvature_per_m * along_m;
@@ -229,6 +245,30 @@ fn arc_poses(curvature_per_m: f64, length_m: f64) -> Result<Vec<PathPose>, Shape
         PathPose { along_m: along_m.abs(), place: [chord_m * cos, chord_m * sin], heading_rad: heading_rad % TAU }
     };
     Ok((0..=steps).map(pose).collect())
+}
+
+/// Steps of at most [`STEP_M`] on a way.
+fn steps(way_m: f64) -> u32 {
+    (way_m / STEP_M).ceil().max(1.0) as u32
+}
+
+/// The turn from one heading to another, in radians, positive to the left.
+fn shorter_turn(from_rad: f64, to_rad: f64) -> f64 {
+    let turn_rad = to_rad - from_rad;
+    if turn_rad > PI {
+        turn_rad - TAU
+    } else if turn_rad <= -PI {
+        turn_rad + TAU
+    } else {
+        turn_rad
+    }
+}
+
+/// The way of the farthest corner by a turn, in metres.
+fn turn_m(turn_rad: f64, reach_m: f64) -> Result<f64, ShapeError> {
+    let way_m = turn_rad.abs() * reach_m;
+    path_length("the turn of the farthest corner", way_m)?;
+    Ok(way_m)
 }
 
 fn finite(what: impl Fn() -> String, value: f64) -> Result<(), ShapeError> {
@@ -246,9 +286,10 @@ pub(super) fn finite_point(point: [f64; 2]) -> Result<(), ShapeError> {
     ["x_m", "y_m"].into_iter().zip(point).try_for_each(|(what, value)| finite(|| what.into(), value))
 }
 
-fn path_length(value: f64) -> Result<(), ShapeError> {
+/// Checks the length of a way. A length that is not a number is too long.
+fn path_length(what: &'static str, value: f64) -> Result<(), ShapeError> {
     let allowed = "0 to 1000";
-    if value > PATH_M_MAX { Err(ShapeError::Length { what: "the path", value, allowed }) } else { Ok(()) }
+    if value <= PATH_M_MAX { Ok(()) } else { Err(ShapeError::Length { what, value, allowed }) }
 }
 
 /// The places without those that repeat the place before.

@@ -18,12 +18,16 @@ type Xy = [f64; 2];
 pub struct Touched {
     /// Indices of the cells, each once, ascending.
     pub cells: Vec<usize>,
-    /// The first corner outside the grid or on its border; the polygon is wholly inside if `None`.
+    /// The first corner outside the grid, on its border or infinitely far; the polygon is wholly inside if `None`.
     pub outside: Option<Xy>,
 }
 
 /// The cells of a grid that a polygon touches.
 pub fn touched(grid: &Grid, corners: &[Xy]) -> Touched {
+    // No comparison of a number that is none would find a cell.
+    if let Some(corner) = corners.iter().find(|corner| !corner.iter().all(|value| value.is_finite())) {
+        return Touched { cells: Vec::new(), outside: Some(*corner) };
+    }
     let mut cells = Vec::new();
     let is_outside = match grid {
         Grid::Radial { centre_m, row_radius_m, columns } => {

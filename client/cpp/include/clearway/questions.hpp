@@ -168,7 +168,7 @@ inline bool is_free(const Layer& layer, const Polygon& polygon) {
 // allowed.
 inline Along along(const Layer& layer, const Path& path, const Outline& outline) {
     outline.check();
-    const auto poses = std::visit([](const auto& kind) { return shapes::poses_of(kind); }, path);
+    const auto poses = std::visit([&](const auto& kind) { return shapes::poses_of(kind, outline.reach_m()); }, path);
     Along met{poses.back().along_m, std::nullopt, std::nullopt};
     for (const shapes::PathPose& pose : poses) {
         const Answer found = asking::answer(layer, outline.at(pose.place, pose.heading_rad), pose.place);

@@ -27,7 +27,8 @@ using Path = std::variant<Arc, std::vector<Point>>;
 
 namespace shapes {
 
-// Most corners of a polygon and places of a path, longest path, and greatest distance between two judged poses.
+// Most corners of a polygon and places of a path, longest path, greatest distance between two judged poses, and greatest
+// way of the farthest corner by turning between them.
 inline constexpr std::size_t CORNERS_MAX = 1000;
 inline constexpr double PATH_M_MAX = 1000.0;
 inline constexpr double STEP_M = 0.1;
@@ -90,11 +91,27 @@ inline Polygon corners_of(const Polygon& polygon) {
     return corners;
 }
 
-inline std::vector<PathPose> poses_of(const Arc& arc) {
+// Steps of at most STEP_M on a way.
+inline double steps_on(double way_m) { return std::max(1.0, std::ceil(way_m / STEP_M)); }
+
+// The turn from one heading to another, the shorter way, to the left if both are equal.
+inline double shorter_turn(double from_rad, double to_rad) {
+    const double turn_rad = to_rad - from_rad;
+    return turn_rad > TAU / 2 ? turn_rad - TAU : turn_rad <= -TAU / 2 ? turn_rad + TAU : turn_rad;
+}
+
+// The way of the farthest corner by a turn.
+inline double turn_m(double turn_rad, double reach_m) {
+    const double way_m = std::abs(turn_rad) * reach_m;
+    require(way_m <= PATH_M_MAX, "length", "the turn of the farthest corner is ", way_m, " m; 0 to 1000 m is allowed");
+    return way_m;
+}
+
+inline std::vector<PathPose> poses_of(const Arc& arc, double reach_m) {
     check_finite("curvature_per_m", arc.curvature_per_m);
     check_finite("length_m", arc.length_m);
     check_length("the path", std::abs(arc.length_m), PATH_M_MAX);
-    const double steps = std::max(1.0, std::ceil(std::abs(arc.length_m) / STEP_M));
+    const double steps = steps_on(std::max(std::abs(arc.length_m), turn_m(arc.curvature_per_m * arc.length_m, reach_m)));
     std::vector<PathPose> poses;
     for (double step = 0; step <= steps; ++step) {
         const double along_m = step / steps * arc.length_m;
@@ -108,7 +125,7 @@ inline std::vector<PathPose> poses_of(const Arc& arc) {
     return poses;
 }
 
-inline std::vector<PathPose> poses_of(const std::vector<Point>& given) {
+inline std::vector<PathPose> poses_of(const std::vector<Point>& given, double reach_m) {
     const std::vector<Point> places = distinct(given, false);
     std::vector<PathPose> poses;
     double before_m = 0;
@@ -117,11 +134,20 @@ inline std::vector<PathPose> poses_of(const std::vector<Point>& given) {
         const double dx = places[at + 1].x_m - a.x_m, dy = places[at + 1].y_m - a.y_m;
         const double stretch_m = std::hypot(dx, dy);
         check_length("the path", before_m + stretch_m, PATH_M_MAX);
-        const double steps = std::max(1.0, std::ceil(stretch_m / STEP_M));
+        const double heading_rad = std::atan2(dy, dx);
+        if (!poses.empty()) {
+            const PathPose before = poses.back();
+            const double turn_rad = shorter_turn(before.heading_rad, heading_rad);
+            const double steps = steps_on(turn_m(turn_rad, reach_m));
+            for (double step = 1; step < steps; ++step) {
+                poses.push_back({before.along_m, before.place, before.heading_rad + step / steps * turn_rad});
+            }
+        }
+        const double steps = steps_on(stretch_m);
         for (double step = 0; step <= steps; ++step) {
             const double share = step / steps;
             const Point place{a.x_m + share * dx, a.y_m + share * dy};
-            poses.push_back({before_m + share * stretch_m, place, std::atan2(dy, dx)});
+            poses.push_back({before_m + share * stretch_m, place, heading_rad});
         }
         before_m += stretch_m;
     }
@@ -142,6 +168,9 @@ struct Outline {
         };
         return {corner(front_m, -left), corner(front_m, left), corner(-rear_m, left), corner(-rear_m, -left)};
     }
+
+    // Distance of the farthest corner from the reference point.
+    double reach_m() const { return std::hypot(std::max(front_m, rear_m), width_m / 2.0); }
 
     void check() const {
         shapes::check_length("front_m", front_m);

@@ -156,6 +156,9 @@ inline bool leaves(const Grid& grid, Point point) {
 
 inline Touched touched(const Grid& grid, const Polygon& corners) {
     Touched found;
+    for (const Point corner : corners) {
+        if (!std::isfinite(corner.x_m) || !std::isfinite(corner.y_m)) return {{}, corner};
+    }
     Polygon own = corners;
     bool is_outside = false;
     if (const RadialGrid* rings = grid.radial()) {
