@@ -201,7 +201,7 @@ fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config,
     let json = |value: serde_json::Value| value.to_string();
     let settings = [
         ("mode", json(options.mode.as_str().into())),
-        ("listen/endpoints", json(options.listen.clone().into())),
+        ("listen/endpoints", json(options.listened().into())),
         ("connect/endpoints", json(options.connect.clone().into())),
         ("scouting/multicast/enabled", json(options.scouting.into())),
         // Peers behind one router, such as ROS 2 nodes behind rmw_zenohd, reach one another without it.

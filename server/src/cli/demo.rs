@@ -17,7 +17,8 @@ use super::shared::output::{block_on, print_line, stop_signal};
 ///
 /// A simulation that is too slow for this machine skips time and reports it. The drive is recorded, and the page saves
 /// its last seconds when asked (a black box); without --record the recording is in the temporary folder, and all but
-/// the saves is deleted at the end. The newest map is drawn to target/demo.png, or demo.png in the temporary folder.
+/// the saves is deleted at the end. The newest map is drawn beside the recording, else to
+/// target/demo.png, or demo.png in the temporary folder.
 /// The last lines say what is left on the disk, and what the maps cost.
 #[derive(Args)]
 #[command(after_help = "Examples:

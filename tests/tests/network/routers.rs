@@ -36,7 +36,9 @@ async fn a_server_and_a_planner_start_with_each_of_their_routers_missing_and_use
             let mut endpoints = [format!("tcp/127.0.0.1:{late}"), at.clone()];
             endpoints.swap(0, missing);
             let mut config = config();
-            (config.zenoh.enabled, config.zenoh.mode, config.zenoh.listen) = (true, mode, Vec::new());
+            // A client beside its router has the router's endpoint as its default, and does not listen there.
+            let listen = if mode == ZenohMode::Client { vec![at.clone()] } else { Vec::new() };
+            (config.zenoh.enabled, config.zenoh.mode, config.zenoh.listen) = (true, mode, listen);
             config.zenoh.connect = endpoints.to_vec();
             let server = within(&format!("a start, {what}"), start(config)).await;
             let car = Driving::to(&server);

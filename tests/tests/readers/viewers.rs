@@ -11,12 +11,14 @@ use clearway_daemon::encode::viewer::Raster;
 use clearway_daemon::encode::viewer::aligned::AlignedGrid;
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::run::{Running, Server, Setup};
+use clearway_daemon::status::Transport;
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
 use clearway_tests::workspace;
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
 use zenoh::handlers::FifoChannelHandler;
+use zenoh::query::ReplyKeyExpr;
 use zenoh::sample::Sample;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig};
 
@@ -147,6 +149,12 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
+/// True if a grid has a known cell.
+fn is_known(grid: &Sample) -> bool {
+    // Header, info and count end before the cells; the last cells are in a corner.
+    grid.payload().to_bytes()[200..].iter().any(|&value| value != u8::MAX)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn the_grid_of_a_sensor_that_stops_becomes_unknown_once_and_a_late_subscriber_gets_no_other() {
     let mut config = ros2();
@@ -169,9 +177,7 @@ async fn the_grid_of_a_sensor_that_stops_becomes_unknown_once_and_a_late_subscri
         let sample = within("a grid", subscriber.recv_async()).await.unwrap();
         let message = sample.payload().to_bytes();
         let stamp_ns = clearway_ros::cdr::Reader::new(&message).unwrap().header().unwrap().stamp_ns;
-        // Header, info and count end before the cells; the last cells are in a corner.
-        let known = message[200..].iter().any(|&value| value != u8::MAX);
-        (stamp_ns, known)
+        (stamp_ns, is_known(&sample))
     };
     let first = subscribe().await;
     let mut fed = readings(4);
@@ -189,6 +195,20 @@ async fn the_grid_of_a_sensor_that_stops_becomes_unknown_once_and_a_late_subscri
         let (stamp_ns, known) = next(subscriber).await;
         assert!(known && stamp_ns > known_ns, "the unknown grid came once");
     }
+    // Nobody hears the map that becomes stale next, but the cache answers who comes then.
+    for subscriber in [first, late] {
+        subscriber.undeclare().await.unwrap();
+    }
+    let has_reader = || running.vehicles.0[0].status.transports.count(Transport::Ros) > 0;
+    within("no reader", async {
+        while has_reader() {
+            tokio::task::yield_now().await
+        }
+    })
+    .await;
+    let of_cache = session.get("clearway/car/freespace/@adv/**").accept_replies(ReplyKeyExpr::Any);
+    let cached = within("the cache", of_cache.await.unwrap().recv_async()).await.unwrap().into_result().unwrap();
+    assert!(!is_known(&cached), "the grid of the cache looks fresh for ever");
     session.close().await.unwrap();
     within("shutdown", running.shutdown()).await.unwrap();
 }

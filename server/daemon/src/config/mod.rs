@@ -424,7 +424,7 @@ impl Config {
             let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
             host != "localhost" && !host.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
         };
-        let endpoint = self.zenoh.listen.iter().find(is_public).filter(|_| self.zenoh.enabled);
+        let endpoint = self.zenoh.listened().iter().find(is_public).filter(|_| self.zenoh.enabled);
         if let Some(endpoint) = endpoint.filter(|_| self.zenoh.file.as_os_str().is_empty())
             && !is_allowed(Service::Zenoh)
         {

@@ -19,7 +19,7 @@ pub struct Zenoh {
     pub enabled: bool,
     /// Role in the zenoh network.
     pub mode: ZenohMode,
-    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
+    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`; see [`Self::listened`].
     pub listen: Vec<String>,
     /// Endpoints of routers or peers to connect to.
     pub connect: Vec<String>,
@@ -73,6 +73,12 @@ impl Zenoh {
             return Err(ValueError::new("zenoh.max_rate_hz", self.max_rate_hz, allowed));
         }
         self.ros2.check(self.enabled, vehicles)
+    }
+
+    /// The endpoints that the session listens on: none in the mode `client`, whose router on the same host has the
+    /// default one.
+    pub fn listened(&self) -> &[String] {
+        if self.mode == ZenohMode::Client { &[] } else { &self.listen }
     }
 
     /// Shortest time between two maps of a vehicle.

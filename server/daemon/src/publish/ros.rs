@@ -10,8 +10,8 @@
 //! attachment: sequence, time of sending, length 16, the publisher's 16 bytes.
 //!
 //! A message is made only while there is a subscriber; the first subscriber gets the newest map at once, later ones get
-//! it from the publisher's cache. When the newest map becomes stale, its grids are sent once more, unknown, so that no
-//! cache keeps a grid that looks fresh.
+//! it from the publisher's cache. When the newest map becomes stale, or the last subscriber leaves, its grids are sent
+//! once more, unknown, so that no cache keeps a grid that looks fresh.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
@@ -225,7 +225,7 @@ struct Topic {
 
 impl Topic {
     /// Sends the message of each newest map while there is a subscriber, and keeps the layer active meanwhile. When
-    /// that map becomes stale, sends its message as a stale one, once.
+    /// that map becomes stale, or the last subscriber leaves, sends its message as a stale one, once.
     async fn publish(
         mut self,
         served: Served,
@@ -271,7 +271,11 @@ impl Topic {
                     }
                     status = matching.recv_async() => match status {
                         Ok(status) if status.matching() => {}
-                        Ok(_) => break,
+                        Ok(_) => {
+                            let map = newest.borrow().clone();
+                            self.put(map.and_then(|map| make(&map, false))).await;
+                            break;
+                        }
                         Err(_) => return,
                     },
                 }

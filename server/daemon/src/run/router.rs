@@ -19,20 +19,27 @@ const PERIOD: Duration = Duration::from_millis(500);
 const ASK_PERIOD: Duration = Duration::from_secs(5);
 const ASK_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// What uses the session, once there is one.
-pub(super) type Connected = Arc<Mutex<Option<OverZenoh>>>;
+/// What uses the session, once there is one; before, why the newest attempt to open it failed.
+#[derive(Default)]
+pub(super) struct Connection {
+    pub over_zenoh: Option<OverZenoh>,
+    pub failure: String,
+}
+
+/// The connection, which the server and its tasks share.
+pub(super) type Connected = Arc<Mutex<Connection>>;
 
 /// Opens the session as soon as a router answers, and starts what uses it.
 pub(super) async fn connect(settings: zenoh::Config, users: Users, connected: Connected) {
     let session = loop {
         match zenoh_session::open(settings.clone(), &users.config.zenoh).await {
             Ok(session) => break session,
-            Err(error) => tracing::debug!(%error, "no session"),
+            Err(error) => connected.lock().await.failure = error.to_string(),
         }
         tokio::time::sleep(PERIOD).await;
     };
     match OverZenoh::start(session, &users).await {
-        Ok(over_zenoh) => *connected.lock().await = Some(over_zenoh),
+        Ok(over_zenoh) => connected.lock().await.over_zenoh = Some(over_zenoh),
         Err(error) => tracing::error!(%error, "no maps over zenoh"),
     }
 }
@@ -44,10 +51,13 @@ pub(super) async fn watch(connected: Connected, endpoints: Vec<String>, vehicles
     let all = endpoints.join(", ");
     loop {
         every.tick().await;
-        let has_router = match &*connected.lock().await {
+        let connection = connected.lock().await;
+        let has_router = match &connection.over_zenoh {
             Some(over_zenoh) => over_zenoh.has_router().await,
             None => false,
         };
+        let failure = connection.failure.clone();
+        drop(connection);
         match (has_router, &mut away) {
             (true, None) => continue,
             (true, Some(was_away)) => {
@@ -62,7 +72,7 @@ pub(super) async fn watch(connected: Connected, endpoints: Vec<String>, vehicles
             }
             (false, Some(away)) if asked.is_none_or(|asked| asked.elapsed() >= ASK_PERIOD) => {
                 asked = Some(Instant::now());
-                let reason = why(&endpoints).await;
+                let reason = why(&endpoints, &failure).await;
                 if reason != away.reason {
                     tracing::warn!(
                         endpoints = all,
@@ -78,8 +88,8 @@ pub(super) async fn watch(connected: Connected, endpoints: Vec<String>, vehicles
     }
 }
 
-/// Why no session with these endpoints comes about, as far as a connection shows it.
-async fn why(endpoints: &[String]) -> String {
+/// Why no session with these endpoints comes about, as far as a connection and the last failure show it.
+async fn why(endpoints: &[String], failure: &str) -> String {
     let mut reasons = Vec::new();
     for endpoint in endpoints {
         let address = endpoint.split_once('/').map_or(endpoint.as_str(), |(_, address)| address);
@@ -92,7 +102,8 @@ async fn why(endpoints: &[String]) -> String {
             TcpStream::connect(&*all).await
         };
         reasons.push(match tokio::time::timeout(ASK_TIMEOUT, connected).await {
-            Ok(Ok(_)) => format!("{address} accepts connections but no session (certificate, roles or limits)"),
+            Ok(Ok(_)) if failure.is_empty() => format!("{address} accepts connections but no session"),
+            Ok(Ok(_)) => format!("{address} accepts connections but no session: {failure}"),
             Ok(Err(error)) => format!("{address}: {error}"),
             Err(_) => format!("{address} does not answer"),
         });

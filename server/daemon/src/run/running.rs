@@ -184,7 +184,7 @@ impl Running {
         #[cfg(feature = "zenoh")]
         {
             self.connecting.shutdown().await;
-            if let Some(over_zenoh) = &mut *self.connected.lock().await {
+            if let Some(over_zenoh) = &mut self.connected.lock().await.over_zenoh {
                 over_zenoh.stop_ros().await;
             }
         }
@@ -210,7 +210,7 @@ impl Running {
             publishers.shutdown().await;
         }
         #[cfg(feature = "zenoh")]
-        if let Some(over_zenoh) = self.connected.lock().await.take()
+        if let Some(over_zenoh) = self.connected.lock().await.over_zenoh.take()
             && tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, over_zenoh.stop()).await.is_err()
         {
             tracing::warn!("zenoh did not close in time");

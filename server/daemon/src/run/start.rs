@@ -209,7 +209,7 @@ impl Running {
         };
         let over_zenoh = OverZenoh::start(session, &users).await?;
         self.zenoh = over_zenoh.endpoints().await;
-        *self.connected.lock().await = Some(over_zenoh);
+        self.connected.lock().await.over_zenoh = Some(over_zenoh);
         Ok(())
     }
 
@@ -423,7 +423,10 @@ fn header(
             }
         }
     }
-    let comments: String = config_comments.iter().map(|comment| format!("# {comment}\n")).collect();
+    // A comment may quote a name of the input, and a comment ends with its line.
+    let shown = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    let line = |comment: &String| format!("# {}\n", comment.chars().map(shown).collect::<String>());
+    let comments: String = config_comments.iter().map(line).collect();
     let vehicles = config.vehicles.iter().map(|v| (v.name.as_str().into(), layer_names(&v.maps))).collect();
     Header { boot_id, config: comments + &config.to_toml(), vehicles, calibrations: tables, metadata }
 }
@@ -436,6 +439,7 @@ pub fn random() -> u64 {
 #[cfg(test)]
 mod tests {
     use std::future::pending;
+    use std::path::Path;
 
     use super::*;
 
@@ -443,6 +447,14 @@ mod tests {
         while !condition() {
             tokio::task::yield_now().await;
         }
+    }
+
+    #[test]
+    fn a_comment_that_quotes_line_breaks_stays_one_comment() {
+        let (config, comment) = (Config::of_one_vehicle("car", "top"), "of velo\r\n[grpc]\nenabled = false\t\u{85}");
+        let text = header(&config, &[], 1, &[comment.to_owned()], BTreeMap::new()).config;
+        assert_eq!(text.lines().next(), Some("# of velo\\r\\n[grpc]\\nenabled = false\\t\\u{85}"));
+        assert_eq!(Config::parse(&text, Path::new("config.toml"), &[]).unwrap().grpc, config.grpc);
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

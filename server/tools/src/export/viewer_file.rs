@@ -14,7 +14,7 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clearway_client::{Layer, MapView, v1};
 use clearway_daemon::config::Ros;
 use clearway_daemon::encode::viewer::frame::isometry;
@@ -52,6 +52,8 @@ pub struct ViewerFile {
     chunk_ns: u64,
     /// The id of each topic's channel and the sequence number of its newest message, by topic.
     channels: HashMap<String, (u16, u32)>,
+    /// The topic that has a name in ROS 2, by that name.
+    ros_names: HashMap<String, String>,
     rasters: BTreeMap<String, Rasters>,
     /// The frames of each vehicle whose input has names for them.
     frames: BTreeMap<String, FrameNames>,
@@ -78,6 +80,7 @@ impl ViewerFile {
             writer: options.create(BufWriter::new(open))?,
             chunk_ns: 0,
             channels: HashMap::new(),
+            ros_names: HashMap::new(),
             rasters: BTreeMap::new(),
             frames: frames_of(recording),
             placed: HashMap::new(),
@@ -229,7 +232,7 @@ impl ViewerFile {
         self.write((topic, BTreeMap::new()), schema, &T::get_message_encoding(), log_ns, &bytes)
     }
 
-    /// Writes a message of a topic, which is latched or not.
+    /// Writes a message of a topic, which is latched or not, under its name in ROS 2 ([`ros_name`]).
     fn write_ros(
         &mut self,
         (topic, is_latched): (&str, bool),
@@ -237,8 +240,10 @@ impl ViewerFile {
         message: &[u8],
         log_ns: u64,
     ) -> Result<()> {
-        let metadata = ros_metadata(is_latched);
-        self.write((topic, metadata), (&kind.name(), "ros2msg", kind.definition.as_bytes()), "cdr", log_ns, message)
+        let (name, metadata) = (ros_name(topic), ros_metadata(is_latched));
+        let first = self.ros_names.entry(name.clone()).or_insert_with(|| topic.to_owned());
+        ensure!(first == topic, "{topic} and {first} have one name in ROS 2, {name}: rename a vehicle or sensor");
+        self.write((&name, metadata), (&kind.name(), "ros2msg", kind.definition.as_bytes()), "cdr", log_ns, message)
     }
 
     fn write(
@@ -286,6 +291,19 @@ fn frames_of(recording: &Header) -> BTreeMap<String, FrameNames> {
     vehicles.into_iter().flatten().map(named).map(|(frames, name)| (name, frames)).collect()
 }
 
+/// A topic with parts that ROS 2 allows: `_` for what is neither a letter nor a digit, and before a digit at the start.
+/// Source: `rmw_validate_full_topic_name` in `rmw/validate_full_topic_name.h`.
+fn ros_name(topic: &str) -> String {
+    let mut name = String::new();
+    for c in topic.chars() {
+        if c.is_ascii_digit() && name.ends_with('/') {
+            name.push('_');
+        }
+        name.push(if c == '/' || c.is_ascii_alphanumeric() { c } else { '_' });
+    }
+    name
+}
+
 /// What rosbag2 offers a topic with when it plays the file, as the live topics are offered: reliable, and of maps the
 /// newest one for subscribers that come later. The numbers come from `rmw/types.h`, which each version reads.
 fn ros_metadata(is_latched: bool) -> BTreeMap<String, String> {
@@ -296,4 +314,15 @@ fn ros_metadata(is_latched: bool) -> BTreeMap<String, String> {
          {unlimited}, liveliness: 1, liveliness_lease_duration: {unlimited}, avoid_ros_namespace_conventions: false}}"
     );
     BTreeMap::from([("offered_qos_profiles".to_owned(), profile)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_topic_has_a_name_that_ros_2_allows() {
+        let named = ["/clearway/my-car/points/front-left", "/clearway/7up/plan", "/tf"].map(ros_name);
+        assert_eq!(named, ["/clearway/my_car/points/front_left", "/clearway/_7up/plan", "/tf"]);
+    }
 }
