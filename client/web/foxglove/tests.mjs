@@ -147,6 +147,17 @@ test("a damaged map gives nothing and is no base", () => {
   assert.equal(warnings.length, 3);
 });
 
+test("a map whose grid, header or stamps are false gives nothing", () => {
+  const base = ofVehicle("false", "delta_base"), [layer] = base.layers, { cartesian, channels } = layer;
+  const [channel] = channels, one = { ...channel, name: "other", cell_count: 1 };
+  const wide = { ...layer, radial: null, cartesian: { ...cartesian, width: 1 << 15, height: 1 << 15 }, channels: [one] };
+  assert.equal(gridOf({ ...base, layers: [wide] }), undefined);
+  const headed = (header) => ({ ...base, header: { ...base.header, ...header } });
+  assert.equal(transformsOf(headed({ map_from_ego: { x: NaN, y: 0, z: 0, qx: 0, qy: 0, qz: 0, qw: 1 } })), undefined);
+  assert.equal(gridOf(headed({ capture_start_ns: -2n, capture_end_ns: -1n })), undefined);
+  assert.deepEqual(warnings.map((text) => text.match(/cell_count|header|before 0/)?.[0]), ["cell_count", "header", "before 0"]);
+});
+
 test("of a map with several layers the one is shown whose name ends the topic, else the first", () => {
   const bytes = golden("map"), message = town.decode(bytes), names = new LiveMap(bytes).names;
   const shown = names.map((name) => gridOf(message, `/car/map/${name}`)?.column_count);

@@ -17,17 +17,23 @@ const LIKELY = 64;
 // The index of the mean of the values, after two means a context.
 const VALUES = 2 * (LIKELY + 1);
 
-// channel: a Channel message. shape: [rows, columns] of the grid. base: a function from an array type to the cells that
-// encoding CHANGES starts from, or null if there are none; it is called after the count is checked.
-export function decodeChannel(channel, [rows, columns], base = null) {
-  const { name, cell_type, cell_count, encoding, payload } = channel;
-  const error = (reason, detail) => new DecodeError(reason, `channel ${name}: ${detail}`);
+// Checks that a channel claims as many cells as the grid has, and no more than a channel may have.
+export function checkCount({ name, cell_count }, [rows, columns]) {
   if (cell_count > CHANNEL_CELLS_MAX) {
-    throw error("too_many_cells", `${cell_count} cells; at most ${CHANNEL_CELLS_MAX} are allowed`);
+    const what = `${cell_count} cells; at most ${CHANNEL_CELLS_MAX} are allowed`;
+    throw new DecodeError("too_many_cells", `channel ${name}: ${what}`);
   }
   if (cell_count !== rows * columns) {
-    throw error("cell_count", `${cell_count} cells; the grid has ${rows} x ${columns}`);
+    throw new DecodeError("cell_count", `channel ${name}: ${cell_count} cells; the grid has ${rows} x ${columns}`);
   }
+}
+
+// channel: a Channel message. shape: [rows, columns] of the grid. base: a function from an array type to the cells that
+// encoding CHANGES starts from, or null if there are none; it is called after the count is checked.
+export function decodeChannel(channel, shape, base = null) {
+  checkCount(channel, shape);
+  const { name, cell_type, cell_count, encoding, payload } = channel, columns = shape[1];
+  const error = (reason, detail) => new DecodeError(reason, `channel ${name}: ${detail}`);
   const Cells = TYPES[cell_type];
   const bytes_saved = Cells ? cell_count * Cells.BYTES_PER_ELEMENT - payload.length : -1;
   const allowed = { [RAW]: bytes_saved === 0, [ROWS]: bytes_saved > 0, [CHANGES]: bytes_saved > 0 && base !== null };

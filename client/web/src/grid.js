@@ -4,7 +4,7 @@
 
 import { DecodeError } from "./limits.js";
 
-// How many cells a grid may have is checked where they are decoded (codec.js).
+// How many cells a grid may have is checked as its layer opens: each channel has as many (codec.js).
 //
 // { key, radius_m, cellAt(x, y) -> the cell's index or -1, fill(table, raster), corners(cell, xy):
 // writes x0, y0 ... x3, y3, in order around the cell, is_straight: true if the cells of a row are one rectangle, with

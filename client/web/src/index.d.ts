@@ -57,7 +57,7 @@ export interface Layer {
   cells(channel: string): Uint8Array | Int8Array | Uint16Array | null;
 }
 
-/** A map. Layers are decoded at the first access, which may throw a `DecodeError` or a `WireError`. */
+/** A map. Layers are decoded at the first access, which may throw a `DecodeError`. */
 export class LiveMap {
   /**
    * `map`: an encoded `clearway.v1.Map`, or that message as another protobuf decoder read it: the field names of
@@ -94,5 +94,7 @@ export class DecodeError extends Error {
   constructor(reason: string, detail: string);
 }
 
-/** Bytes that are no protobuf. */
-export class WireError extends Error {}
+/** Bytes that are no protobuf. `reason` is `protobuf`. */
+export class WireError extends DecodeError {
+  constructor(detail: string);
+}

@@ -1,7 +1,7 @@
 // In: the bytes of a MapUpdate or of a Map, or a Map message as another protobuf decoder read it. Out: the map, whose
 // layers and channels are decoded when they are first needed, or a DecodeError or WireError that says what is wrong.
 
-import { baseByClass, decodeChannel } from "./codec.js";
+import { baseByClass, checkCount, decodeChannel } from "./codec.js";
 import { baseCells, baseLayer } from "./delta.js";
 import { gridOf } from "./grid.js";
 import { isWithoutLegend, readLegend } from "./legend.js";
@@ -35,6 +35,7 @@ export class LiveMap {
     if (header.wire_version > WIRE_VERSION) {
       throw new DecodeError("version", `${header.wire_version}; versions up to ${WIRE_VERSION} are known`);
     }
+    checkHeader(header);
     this.header = header;
     for (const layer of layers) {
       const name = ArrayBuffer.isView(layer) ? readLayerName(layer) : layer.name;
@@ -63,6 +64,19 @@ export class LiveMap {
       throw new DecodeError("too_many_cells", `${this.#cells_claimed} cells; a map may have ${MAP_CELLS_MAX}`);
     }
     return new Layer(message, baseLayer(message, this.header, base));
+  }
+}
+
+// As the Rust client checks it: a capture that does not end before its start, finite metres, a unit quaternion.
+function checkHeader({ capture_start_ns = 0n, capture_end_ns = 0n, map_from_ego }) {
+  if (capture_start_ns > capture_end_ns) {
+    throw new DecodeError("header", `the capture starts at ${capture_start_ns} ns and ends at ${capture_end_ns} ns`);
+  }
+  if (!map_from_ego) return;
+  const { x = 0, y = 0, z = 0, qx = 0, qy = 0, qz = 0, qw = 0 } = map_from_ego, norm = Math.hypot(qx, qy, qz, qw);
+  if (![x, y, z].every(Number.isFinite) || !(Math.abs(norm - 1) <= 1e-3)) {
+    const what = `map_from_ego at (${x}, ${y}, ${z}) m with a quaternion of norm ${norm}`;
+    throw new DecodeError("header", `${what}; finite metres and norm 1 are needed`);
   }
 }
 
@@ -98,6 +112,7 @@ class Layer {
       if (this.#channels.has(channel.name)) {
         throw new DecodeError("twice", `layer ${this.name}: two channels are named ${channel.name}`);
       }
+      checkCount(channel, this.grid.shape);
       this.#channels.set(channel.name, channel);
     }
     this.channels = message.channels.map(({ name, unit, scale, unknown }) => ({ name, unit, scale, unknown }));

@@ -3,11 +3,17 @@
 // 64-bit fields come out as BigInt (stamps in ns exceed 2^53), bytes as views without a copy.
 // Wire format: protobuf.dev/programming-guides/encoding; fields: proto/clearway/v1/{map,service}.proto.
 
+import { DecodeError } from "./limits.js";
+
 const VARINT = 0, FIXED64 = 1, LENGTH = 2, FIXED32 = 5;
 const TEXT = new TextDecoder("utf-8", { fatal: true });
 
-export class WireError extends Error {
+// Bytes that are no protobuf.
+export class WireError extends DecodeError {
   name = "WireError";
+  constructor(detail) {
+    super("protobuf", detail);
+  }
 }
 
 class Reader {

@@ -64,7 +64,10 @@ function transforms(message: MapMessage): FrameTransforms | undefined {
 }
 
 const baseFrame = ({ vehicle }: Header) => `${vehicle}/base_link`;
-const stamp = (ns: bigint) => ({ sec: Number(ns / 1_000_000_000n), nsec: Number(ns % 1_000_000_000n) });
+function stamp(ns: bigint) {
+  if (ns < 0n) throw new Error(`capture_end_ns is ${ns}; Foxglove has no time before 0`);
+  return { sec: Number(ns / 1_000_000_000n), nsec: Number(ns % 1_000_000_000n) };
+}
 const aboutZ = (yaw: number): Quaternion => ({ x: 0, y: 0, z: Math.sin(yaw / 2), w: Math.cos(yaw / 2) });
 
 /** `convert` without errors: Foxglove draws nothing for undefined. */
