@@ -61,6 +61,7 @@ git archive HEAD LICENSE client proto | tar -x -C "$root/source"
 python3 -m venv "$root/venv"
 "$root/venv/bin/pip" install --quiet build
 "$root/venv/bin/python" -m build --outdir "$folder" "$root/source/client/python" >/dev/null
+cp "$root/source/LICENSE" "$root/source/client/web"
 npm pack --silent --pack-destination "$folder" "$root/source/client/web" >/dev/null
 cd "$root/source/client/web/foxglove"
 npm install --silent --no-audit --no-fund >/dev/null

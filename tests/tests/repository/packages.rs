@@ -60,7 +60,8 @@ fn the_package_of_the_browsers_decoder_is_used_from_typescript_where_only_it_is_
 #[cfg_attr(not(clearway_npm), ignore = "needs npm: apt-get install npm")]
 fn the_extension_for_foxglove_is_packed_and_shows_the_grids_of_the_servers_own_output() {
     let folder = tempfile::tempdir().unwrap();
-    for (from, to) in [("client/web", "client"), ("client/golden", "client"), ("proto/golden", "proto")] {
+    let copied = [("client/web", "client"), ("client/golden", "client"), ("proto/golden", "proto"), ("LICENSE", "")];
+    for (from, to) in copied {
         fs::create_dir_all(folder.path().join(to)).unwrap();
         run(Command::new("cp").arg("-r").arg(workspace().join(from)).arg(folder.path().join(to)), "cp");
     }
@@ -79,7 +80,7 @@ fn the_extension_for_foxglove_is_packed_and_shows_the_grids_of_the_servers_own_o
     }
     assert_eq!(commands.len(), 3, "{commands:?}");
     let packed = fs::read(extension.join("clearway.clearway-foxglove-0.1.0.foxe")).unwrap();
-    let names = ["package.json", "README.md", "CHANGELOG.md", "dist/extension.js"];
+    let names = ["package.json", "README.md", "CHANGELOG.md", "dist/extension.js", "dist/LICENSE"];
     assert!(names.iter().all(|name| packed.windows(name.len()).any(|bytes| bytes == name.as_bytes())));
     println!("the extension has {} bytes", packed.len());
 }
