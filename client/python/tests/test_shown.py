@@ -176,6 +176,23 @@ def test_a_recording_gives_its_maps_with_all_layers_and_its_plans_in_order(recor
         next(clearway.read_all(recording, "bus"))
 
 
+def test_a_recording_that_is_damaged_anywhere_is_an_error_that_names_it(recording):
+    sound, random = recording.read_bytes(), np.random.default_rng(7)
+    truth = [str(m.layers) if isinstance(m, clearway.Map) else m for m in clearway.read_all(recording)]
+    for at in random.integers(0, len(sound), 200):
+        damaged = bytearray(sound)
+        damaged[at] ^= 1 << int(random.integers(8))
+        recording.write_bytes(damaged)
+        try:
+            found = [str(m.layers) if isinstance(m, clearway.Map) else m for m in clearway.read_all(recording)]
+            assert found == truth, at
+        except clearway.ClearwayError as error:
+            assert str(recording) in str(error), at
+    for path in (recording.parent, recording.parent / "none.mcap"):
+        with pytest.raises(clearway.ClearwayError, match=str(path)):
+            next(clearway.read(path, "freespace"))
+
+
 #: What the example logs of the recording above. The plan is cleared after 2 s.
 IN_RERUN = {
     "world/car": 2, "world/car/freespace": 2, "world/car/terrain": 2, "legend/freespace": 1, "legend/terrain": 1,
