@@ -18,7 +18,7 @@ from .costmap import OccupancyGrid, costmap, occupancy_grid
 from .errors import ClearwayError, DecodeError
 from .freshness import Arrival, Clock, now_ns
 from .layer import Layer
-from .limits import MAP_BYTES_MAX, MAP_CELLS_MAX, WIRE_VERSION
+from .limits import MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX, WIRE_VERSION, count_parts
 from .v1 import map_pb2
 
 #: Longest time after its capture for which a map is believed to be valid (the Rust client's view.rs).
@@ -34,6 +34,8 @@ class Map:
         """`base`: the base map of layers that are deltas; whole layers do not need it."""
         if len(encoded) > MAP_BYTES_MAX:
             raise DecodeError("too_long", f"map of {len(encoded)} bytes; at most {MAP_BYTES_MAX} are allowed")
+        if count_parts(encoded) > MAP_PARTS_MAX:
+            raise DecodeError("too_many_parts", f"over {MAP_PARTS_MAX} layers, channels, planes, sensors and names")
         try:
             message = map_pb2.Map.FromString(encoded)
         except ProtobufError as fault:

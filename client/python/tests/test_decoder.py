@@ -32,6 +32,23 @@ def test_the_limits_are_those_of_every_client_language():
         assert getattr(limits, name.upper()) == value, name
 
 
+@pytest.mark.parametrize("group", [b"", b"\x1b\x1c"], ids=["alone", "behind a group"])
+@pytest.mark.parametrize("tag", ["layers", "channels", "planes", "sensors"])
+def test_a_map_of_too_many_parts_is_refused_before_they_are_made(tag, group):
+    parts = {"layers": (b"", 2), "sensors": (b"\x0a", 10), "channels": (b"\x12", 5), "planes": (b"\x12", 6)}
+    of, number = parts[tag]
+
+    def encoded(count):
+        content = bytes([number << 3 | 2, 0]) * count
+        length = bytes([len(content) & 127 | 128, len(content) >> 7 & 127 | 128, len(content) >> 14])
+        return group + (of + length + content if of else content)
+
+    assert limits.count_parts(encoded(limits.MAP_PARTS_MAX - 1)) == limits.MAP_PARTS_MAX - (not of)
+    with pytest.raises(clearway.DecodeError) as refused:
+        Map(encoded(limits.MAP_PARTS_MAX + 1))
+    assert refused.value.reason == "too_many_parts"
+
+
 @pytest.mark.parametrize("vector", golden("channels.json"), ids=lambda vector: vector["name"])
 def test_a_channel_has_the_cells_that_were_encoded(vector):
     expected = [value for value, length in vector["cells_value_length"] for _ in range(length)]
