@@ -9,12 +9,14 @@
 //   arc <layer> <outline> <curvature> <length>                of a path; so does `places <layer> <outline> <x> <y> ...`
 //   nearest_obstacle <layer> <x> <y> [<outline>]              so does `nearest_low`
 //   clearance <layer> <most> <passes low things: 0 or 1>
+//   address <certificates: 0 or 1> <address>                  what is wrong with it, as text
 //
 // With the macro CLEARWAY_STREAM also, of a server:
 //
-//   watch <address> <once, or reconnects> <deltas: 0 or 1> <layer> ...   opens a stream of maps
-//   next                                                      waits for a map or for STALE; the map of the questions
+//   watch <address> <once, or reconnects> <deltas: 0 or 1> [@<vehicle>] <layer> ...   opens a stream of maps
+//   next [<timeout ms>]                                       waits for a map or for STALE; the map of the questions
 //   reasons                                                   why no map comes
+#include <clearway/address.hpp>
 #include <clearway/questions.hpp>
 #ifdef CLEARWAY_STREAM
 #include <clearway/grpc.hpp>
@@ -174,11 +176,19 @@ std::optional<std::string> answered_by_stream(const std::string& ask, Words& wor
         wanted.reconnects = words.word() == "reconnects";
         wanted.deltas = words.word() == "1";
         while (words.has_more()) wanted.layers.push_back(words.word());
+        if (!wanted.layers.empty() && wanted.layers[0][0] == '@') {
+            wanted.vehicle = wanted.layers[0].substr(1);
+            wanted.layers.erase(wanted.layers.begin());
+        }
         stream.emplace(address, wanted);
         return "null";
     }
     if (ask == "next") {
-        map = *stream->next();
+        std::optional<std::chrono::milliseconds> timeout;
+        if (words.has_more()) timeout = std::chrono::milliseconds(static_cast<int>(words.number()));
+        const auto found = stream->next(timeout);
+        if (!found) return "null";
+        map = *found;
         const bool is_stale = map.is_stale(Clocks::now());
         return "[" + std::to_string(map.header.boot_id) + "," + std::to_string(map.header.sequence) + "," +
                std::to_string(stream->skipped()) + "," + std::to_string(stream->left_out()) + "," +
@@ -211,6 +221,11 @@ std::string answered(Words& words, Map& map) {
         raw.payload = payload;
         const Cells cells = decoding::decode_cells(raw, columns, std::nullopt);
         return list(cells, [](std::int32_t cell) { return std::to_string(cell); });
+    }
+    if (ask == "address") {
+        const bool has_certificates = words.word() == "1";
+        std::string target;
+        return hex(wrong_address(words.word(), has_certificates, target));
     }
     if (ask == "use") {
         map = Map::decode(from_hex(words.word()));

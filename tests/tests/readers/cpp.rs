@@ -247,6 +247,18 @@ fn questions() -> Cases {
     cases
 }
 
+/// The addresses that every client accepts and refuses.
+fn check_addresses(program: &Path) {
+    let cases = golden("client/golden/addresses.json");
+    let request = |case: &Value| {
+        format!("address {} {}", u8::from(case["certificates"] == true), case["address"].as_str().unwrap())
+    };
+    let requests: Vec<_> = cases.iter().map(request).collect();
+    for (case, found) in cases.iter().zip(answers(program, &requests)) {
+        assert_eq!(found, text(case["refused"].as_str().unwrap_or_default()), "{case}");
+    }
+}
+
 /// Corners whose differences are infinite are never free, whichever cell is named.
 fn check_overflow(program: &Path) {
     let map: Value = serde_json::from_slice(&file("client/golden/questions.json")).unwrap();
@@ -314,6 +326,7 @@ fn the_cpp_client_decodes_and_answers_as_the_rust_client() {
     let program = compiled(folder.path(), "tests/answers.cpp");
     golden_cases().check(&program);
     questions().check(&program);
+    check_addresses(&program);
     check_overflow(&program);
     check_hostile(&program);
     let header = String::from_utf8(file("client/cpp/include/clearway/wire.hpp")).unwrap();

@@ -259,6 +259,26 @@ async fn a_planner_in_python_survives_a_proxy_that_cuts_and_a_server_that_is_kil
     survive(Planner::start(program)).await;
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(
+    not(clearway_cpp_grpc),
+    ignore = "needs C++ and gRPC: apt-get install g++ cmake libgrpc++-dev libprotobuf-dev"
+)]
+async fn a_planner_in_cpp_waits_no_longer_than_it_asks_and_is_told_of_a_wrong_address_and_vehicle() {
+    let answers = tokio::task::spawn_blocking(|| of_cpp("answers")).await.expect("it is compiled");
+    let mut planner = Planner::start(Command::new(answers));
+    assert_eq!(planner.ask(&format!("watch localhost reconnects 0 {LAYER}")), json!({ "error": "address" }));
+    let server = Stepped::start().await;
+    let at = format!("http://{}", server.replay.grpc);
+    planner.ask(&format!("watch {at} reconnects 0 @beta {LAYER}"));
+    assert_eq!(planner.ask("next"), json!({ "error": "NOT_FOUND" }));
+    planner.ask(&format!("watch {at} reconnects 0 {LAYER}"));
+    assert_eq!(planner.ask("next 1"), Value::Null);
+    server.make(1).await;
+    planner.ask_until("next 1", Value::is_array);
+    assert_eq!(planner.ask("next 1")[1], 0, "the newest map again");
+}
+
 #[test]
 #[cfg_attr(
     not(clearway_cpp_grpc),

@@ -15,6 +15,7 @@
 #include <grpcpp/grpcpp.h>
 #include <grpcpp/support/sync_stream.h>
 
+#include "address.hpp"
 #include "map.hpp"
 
 namespace clearway {
@@ -30,7 +31,7 @@ struct Subscription {
     // Layers may travel as changes of the map before: fewer bytes, the same maps.
     bool deltas = false;
     // A stream that a server or a connection has ended is opened again, after pauses of 0.1 to 5 s, unless the server
-    // refuses the subscription itself.
+    // refuses the subscription itself, or knows no such vehicle before the first map.
     bool reconnects = false;
 };
 
@@ -39,7 +40,9 @@ namespace grpc_stream {
 using Buffer = ::grpc::ByteBuffer;
 using Call = ::grpc::ClientReaderWriter<Buffer, Buffer>;
 
-inline constexpr std::chrono::milliseconds PAUSE_MIN{100}, PAUSE_MAX{5000}, STALE_LATE_MAX{20};
+inline constexpr std::chrono::milliseconds PAUSE_MIN{100}, PAUSE_MAX{5000}, STALE_LATE_MAX{20}, LOOK{1000};
+// A map that is stamped farther ahead of this machine's clock is no reason to refuse maps with earlier stamps.
+inline constexpr std::int64_t AHEAD_NS_MAX = 1'000'000'000;
 
 // A protobuf message that is written field by field.
 struct Message {
@@ -94,7 +97,8 @@ inline std::shared_ptr<::grpc::Channel> channel(const std::string& server,
     arguments.SetInt(GRPC_ARG_USE_LOCAL_SUBCHANNEL_POOL, 1);
     arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
     arguments.SetMaxReceiveMessageSize(static_cast<int>(MAP_BYTES_MAX) + 65'536);
-    return ::grpc::CreateCustomChannel(server, credentials, arguments);
+    const auto used = credentials ? credentials : ::grpc::InsecureChannelCredentials();
+    return ::grpc::CreateCustomChannel(target_of(server, credentials != nullptr), used, arguments);
 }
 
 // All bytes of a message.
@@ -124,16 +128,26 @@ inline bool is_lasting(const Error& ended) {
     return std::find(std::begin(REASONS), std::end(REASONS), ended.reason()) != std::end(REASONS);
 }
 
+// True if a map replaces the newest one: it is of another run, later in this one, or the run has begun anew in it.
+inline bool replaces(const Map& map, const Map& newest, Clocks now) {
+    if (newest.header.boot_id != map.header.boot_id || map.header.sequence > newest.header.sequence) return true;
+    const std::int64_t end_ns = newest.header.capture_end_ns;
+    const bool is_ahead = end_ns > now.wall_ns && end_ns - now.wall_ns > AHEAD_NS_MAX;
+    return !map.is_stale(now) && (map.header.capture_end_ns > end_ns || is_ahead || newest.is_stale(now));
+}
+
 }  // namespace grpc_stream
 
 // Stream of a vehicle's newest maps, which a thread of its own receives. It ends when it is destroyed. `next`, `skipped`
 // and `left_out` are for one thread.
 class MapStream {
 public:
-    // Begins to connect to `HOST:PORT`, in plain text or with the certificates of `grpc::SslCredentials`.
-    explicit MapStream(std::string address, Subscription wanted = {},
-                       std::shared_ptr<::grpc::ChannelCredentials> credentials = ::grpc::InsecureChannelCredentials())
-        : server_(std::move(address)), wanted_(std::move(wanted)), credentials_(std::move(credentials)),
+    // Begins to connect to `HOST:PORT`, also written `http://HOST:PORT`, in plain text, or with the certificates of
+    // `grpc::SslCredentials` `https://HOST:PORT`. Throws `Error` of reason "address" for another text.
+    explicit MapStream(const std::string& address, Subscription wanted = {},
+                       std::shared_ptr<::grpc::ChannelCredentials> credentials = nullptr)
+        : server_(target_of(address, credentials != nullptr)), wanted_(std::move(wanted)),
+          credentials_(std::move(credentials)),
           thread_([this] { receive_streams(); }) {}
     MapStream(const MapStream&) = delete;
     MapStream& operator=(const MapStream&) = delete;
@@ -149,29 +163,32 @@ public:
     }
 
     // Waits for a map newer than the last one, which counts as handled, or until that one is stale: it is then returned
-    // again, once, at most 20 ms late. Throws `Error` with a reason that Python's client has too: the name of a gRPC
+    // again, once, at most 20 ms late. A wait of `timeout` returns the newest map again, stale or not, and null before
+    // the first. Throws `Error` with a reason that Python's client has too: the name of a gRPC
     // status, "ended" if the server has ended the stream, "replay_ended" (call again for the maps of a replay that is
     // set back), or the fault of a map that is refused.
-    std::shared_ptr<const Map> next() {
+    std::shared_ptr<const Map> next(std::optional<std::chrono::milliseconds> timeout = std::nullopt) {
+        using Steady = std::chrono::steady_clock;
+        const auto start = Steady::now();
         std::unique_lock<std::mutex> lock(mutex_);
         if (given_ == newest_) acknowledge();
         while (true) {
             if (given_ != newest_) return give();
             if (std::exchange(is_replay_end_, false)) fail("replay_ended", "the replay has ended");
             if (ended_) throw *ended_;
-            if (!is_fresh_) {
-                changed_.wait(lock);
-            } else if (given_->is_stale(Clocks::now())) {
+            if (is_fresh_ && given_->is_stale(Clocks::now())) {
                 is_fresh_ = false;
                 return given_;
-            } else {
-                changed_.wait_for(lock, grpc_stream::STALE_LATE_MAX);
             }
+            const auto waited = std::chrono::duration_cast<std::chrono::milliseconds>(Steady::now() - start);
+            if (timeout && waited >= *timeout) return given_;
+            const auto look = is_fresh_ ? grpc_stream::STALE_LATE_MAX : grpc_stream::LOOK;
+            changed_.wait_for(lock, timeout ? std::min(look, *timeout - waited) : look);
         }
     }
 
     // Maps between the last two: skipped because the reader, its link or its connection was slow or away, and left out
-    // by `max_rate_hz`. 0 if the server has started again between.
+    // by `max_rate_hz`. 0 if the server has started again between, or the run has begun anew.
     std::uint64_t skipped() const { return skipped_; }
     std::uint64_t left_out() const { return left_out_; }
 
@@ -185,7 +202,7 @@ private:
     // Returns the newest map. The lock is held.
     std::shared_ptr<const Map> give() {
         const Header& now = newest_->header;
-        const bool is_next = given_ && given_->header.boot_id == now.boot_id;
+        const bool is_next = given_ && given_->header.boot_id == now.boot_id && given_->header.sequence < now.sequence;
         const std::uint64_t between = is_next ? now.sequence - given_->header.sequence - 1 : 0;
         left_out_ = std::exchange(left_out_since_, 0);
         skipped_ = between - std::min(between, left_out_);
@@ -230,9 +247,7 @@ private:
         reasons_.clear();
         unacknowledged_ = map->header.sequence;
         // A stream that is opened again begins with the newest map, also if it was received before.
-        const bool is_known = newest_ && newest_->header.boot_id == map->header.boot_id &&
-                              newest_->header.sequence >= map->header.sequence;
-        if (is_known) return acknowledge();
+        if (newest_ && !grpc_stream::replaces(*map, *newest_, Clocks::now())) return acknowledge();
         newest_ = std::move(map);
         changed_.notify_all();
     }
@@ -278,7 +293,7 @@ private:
             bool is_last = !wanted_.reconnects;
             try {
                 ended = receive_stream();
-                is_last = is_last || grpc_stream::is_lasting(*ended);
+                is_last = is_last || grpc_stream::is_lasting(*ended) || (ended->reason() == "NOT_FOUND" && !newest_);
             } catch (const Error& refused) {
                 ended = refused;
                 is_last = true;
