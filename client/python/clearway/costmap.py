@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from .errors import ClearwayError
 from .grid import CartesianGrid
+from .limits import CHANNEL_CELLS_MAX
 from .v1 import map_pb2
 
 if TYPE_CHECKING:
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 #: Edge of the cells to which radial layers are resampled, in metres: as other layers have them. Most such cells from
 #: the vehicle to the edge; larger grids get larger cells.
 _CELL_M, _CELLS_MAX = 0.25, 1000
+#: Most cells from the frame's origin, whose numbers are exact, and most cells: a turned square has twice its own.
+_EDGES_MAX, _AREA_MAX = 1 << 40, 4 * CHANNEL_CELLS_MAX
 #: From the best to the worst: free cells have the occupancies 0 to 50, and then:
 _UNKNOWN, _OCCUPIED = 99, 100
 _NARROW = 50
@@ -102,6 +106,9 @@ def _aligned(
 
     placed = in_edges(corners)
     first, end = np.floor(placed.min(axis=0)), np.ceil(placed.max(axis=0))
+    if not (np.abs(placed).max() <= _EDGES_MAX and (end - first).prod() <= _AREA_MAX):
+        text = f"layer {layer.name!r}, its vehicle at ({x_m}, {y_m}) m: the corners lie at {first} to {end} cells"
+        raise ClearwayError("extent", f"{text} of {edge_m} m; up to {_EDGES_MAX} and {_AREA_MAX} cells are allowed")
     width, height = (end - first).astype(int).tolist()
     iy, ix = np.mgrid[:height, :width]
     x, y = (first[0] + ix + 0.5) * edge_m - x_m, (first[1] + iy + 0.5) * edge_m - y_m

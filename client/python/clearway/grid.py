@@ -38,7 +38,8 @@ class RadialGrid:
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
         x_m, y_m = np.asarray(x_m) - self.centre_m[0], np.asarray(y_m) - self.centre_m[1]
-        row = np.searchsorted(self.row_radius_m, np.hypot(x_m, y_m), side="left")
+        with np.errstate(over="ignore"):
+            row = np.searchsorted(self.row_radius_m, np.hypot(x_m, y_m), side="left")
         share = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
         column = np.minimum((share * self.columns).astype(np.int64), self.columns - 1)
         return np.where(row < len(self.row_radius_m), row * self.columns + column, -1)
@@ -107,10 +108,12 @@ class CartesianGrid:
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        ix = np.floor((x_m * cos - y_m * sin - self.origin_x_m) / self.cell_m).astype(np.int64)
-        iy = np.floor((x_m * sin + y_m * cos - self.origin_y_m) / self.cell_m).astype(np.int64)
-        inside = (ix >= 0) & (ix < self.width) & (iy >= 0) & (iy < self.height)
-        return np.where(inside, iy * self.width + ix, -1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            ix = np.floor((x_m * cos - y_m * sin - self.origin_x_m) / self.cell_m)
+            iy = np.floor((x_m * sin + y_m * cos - self.origin_y_m) / self.cell_m)
+            # Compared before they are integers, which far places have not.
+            inside = (ix >= 0) & (ix < self.width) & (iy >= 0) & (iy < self.height)
+            return np.where(inside, iy * self.width + ix, -1).astype(np.int64)
 
     def nearest(self, cells: np.ndarray, x_m: float, y_m: float) -> np.ndarray:
         """The point of each of these cells (indices) that is nearest to a point, shape (n, 2)."""

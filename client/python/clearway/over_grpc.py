@@ -37,7 +37,7 @@ _OPTIONS = [
 ]
 _TIMEOUT_S = 5.0
 #: Shortest and longest pause before a stream is opened again, and the reasons for which it is not: another attempt
-#: would end in the same way.
+#: would end in the same way. An unknown vehicle is one too, before the first map.
 _PAUSE_S = (0.1, 5.0)
 _LASTING = {"INVALID_ARGUMENT", "PERMISSION_DENIED", "UNAUTHENTICATED", "FAILED_PRECONDITION", "UNIMPLEMENTED"}
 _log = logging.getLogger("clearway")
@@ -164,7 +164,8 @@ def watch(
             except Exception as error:  # noqa: BLE001: any error ends the stream.
                 slot.end(ClearwayError("protobuf", f"{of.address}: {error}"))
                 return
-            if not reconnect or ended.reason in _LASTING or slot.closed:
+            is_unknown = ended.reason == "NOT_FOUND" and slot.newest() is None
+            if not reconnect or ended.reason in _LASTING or is_unknown or slot.closed:
                 slot.end(ended)
                 return
             _log.warning("%s; the stream of maps is opened again", ended)

@@ -21,6 +21,8 @@ from .shapes import Arc, Outline, Point, Pose, corners_of, finite, length, poses
 
 #: Distance in metres below which a point touches a cell: far more than the rounding errors of a point on a map.
 _TOUCH_M = 1e-9
+#: Places far outside of a map may overflow: what is no number is never free.
+_overflows = np.errstate(over="ignore", invalid="ignore")
 #: One number for all stretches of a line, or one for each.
 Numbers = float | np.ndarray
 #: What a class is to a vehicle that drives onto it.
@@ -85,9 +87,11 @@ class Asked:
         self._grid, self._classes, self._names, self._why = grid, classes.ravel(), names, why
         self._kinds = np.array([*kinds], dtype=np.int64)
 
+    @_overflows
     def answer(self, polygon: Sequence[Point]) -> Answer:
         return self._answer(corners_of(polygon), (0.0, 0.0))
 
+    @_overflows
     def along(self, path: Arc | Sequence[Point], outline: Outline) -> Along:
         outline.check()
         poses = poses_of(path, outline)
@@ -103,6 +107,7 @@ class Asked:
             low = low or (pose.along_m, answer.blocker)
         return Along(poses[-1].along_m, low, None)
 
+    @_overflows
     def nearest(self, wanted: np.ndarray, x_m: float, y_m: float, own: Outline | None) -> Obstacle | None:
         """The nearest point of a cell of a wanted class; cells with their centre within `own` do not count."""
         x_m, y_m = finite("x_m", x_m), finite("y_m", y_m)
@@ -127,7 +132,7 @@ class Asked:
         height, width = self._grid.shape
         kinds = self._kinds[self._classes].reshape(height, width)
         free = (kinds == FREE) | (passes_low & (kinds == LOW))
-        reach = min(math.ceil(most_m / self._grid.cell_m + 0.5), height + width)
+        reach = math.ceil(min(most_m / self._grid.cell_m + 0.5, height + width))
         down = _halves(_steps_down(free, reach))
         squared: np.ndarray = down.copy()
         for by in range(1, min(reach, width) + 1):
@@ -148,7 +153,7 @@ class Asked:
         if not isinstance(grid, CartesianGrid):
             return np.zeros(len(poses), dtype=bool)
         length_m = outline.front_m + outline.rear_m
-        parts = max(1, min(8, math.ceil(length_m / max(outline.width_m, 0.1))))
+        parts = max(1, math.ceil(min(8.0, length_m / max(outline.width_m, 0.1))))
         x = np.linspace(-outline.rear_m, outline.front_m, parts + 1)[:, None]
         y = np.array([-outline.width_m / 2.0, outline.width_m / 2.0])
         heading = np.array([pose.heading_rad for pose in poses])[:, None, None]
@@ -162,13 +167,13 @@ class Asked:
         # Each part lies between two of the lines across the outline.
         first = [np.minimum(of.min(axis=2)[:, :-1], of.min(axis=2)[:, 1:]) for of in (u, v)]
         last = [np.maximum(of.max(axis=2)[:, :-1], of.max(axis=2)[:, 1:]) for of in (u, v)]
-        # A place far outside has no cell number.
-        most = grid.width + grid.height
-        left, low = (np.floor(of - slack).clip(-1, most).astype(np.int64) for of in first)
-        right, high = (np.floor(of + slack).clip(-1, most).astype(np.int64) + 1 for of in last)
+        left, low = (np.floor(of - slack) for of in first)
+        right, high = (np.floor(of + slack) + 1.0 for of in last)
+        # False if one is not a number. A place far outside has no cell number.
         is_inside = (left >= 0) & (low >= 0) & (right <= grid.width) & (high <= grid.height)
         if not is_inside.any():
             return np.zeros(len(poses), dtype=bool)
+        left, low, right, high = (np.where(is_inside, of, 0.0).astype(np.int64) for of in (left, low, right, high))
         row, column = low[is_inside].min(), left[is_inside].min()
         near = self._classes.reshape(grid.shape)[row : high[is_inside].max(), column : right[is_inside].max()]
         # For each corner of the cells near the path: how many that are not free lie in the rows and columns before it.
@@ -236,9 +241,9 @@ class _Spans:
 
     def add(self, lines: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
         self.is_outside |= bool((first < 0).any() or (last >= self._cells).any())
-        first, last = np.clip(first, 0, self._cells), np.clip(last + 1, 0, self._cells)
-        np.add.at(self._borders, (lines, first.astype(np.int64)), 1)
-        np.add.at(self._borders, (lines, last.astype(np.int64)), -1)
+        first, last = _limited(first, self._cells), _limited(last + 1, self._cells)
+        np.add.at(self._borders, (lines, first), 1)
+        np.add.at(self._borders, (lines, np.maximum(first, last)), -1)
 
     def mask(self) -> np.ndarray:
         """True for each cell of each line that is touched."""
@@ -259,9 +264,9 @@ def _touched_squares(grid: CartesianGrid, corners: np.ndarray) -> tuple[np.ndarr
     u = (x * cos - y * sin - grid.origin_x_m) / grid.cell_m
     v = (x * sin + y * cos - grid.origin_y_m) / grid.cell_m
     slack = _TOUCH_M / grid.cell_m
-    first, last = math.floor(v.min() - slack), math.floor(v.max() + slack)
-    rows = np.arange(max(first, 0), min(last, grid.height - 1) + 1)
-    spans, start = _Spans(len(rows), grid.width), max(first, 0)
+    first, last = np.floor(np.fmin.reduce(v) - slack), np.floor(np.fmax.reduce(v) + slack)
+    start, end = _limited(np.array([first, last + 1]), grid.height).tolist()
+    rows, spans = np.arange(start, end), _Spans(max(end - start, 0), grid.width)
     crossings: list[tuple[np.ndarray, np.ndarray]] = []
     for a, b in zip(np.stack([u, v], axis=-1), np.roll(np.stack([u, v], axis=-1), -1, axis=0)):
         starts, ends, kept = _clip(*_repeated(a, b, len(rows)), 0.0, 1.0, rows - slack)
@@ -276,7 +281,12 @@ def _touched_squares(grid: CartesianGrid, corners: np.ndarray) -> tuple[np.ndarr
         lines, places = map(np.concatenate, zip(*crossings))
         spans.add_pairs(lines, places, np.floor)
     cells = start * grid.width + np.flatnonzero(spans.mask())
-    return cells, spans.is_outside or first < 0 or last >= grid.height
+    return cells, spans.is_outside or bool(first < 0 or last >= grid.height)
+
+
+def _limited(cells: np.ndarray, most: int) -> np.ndarray:
+    """Numbers of cells from numbers that may be anything: 0 for what is negative or no number, at most `most`."""
+    return np.asarray(np.nan_to_num(np.clip(cells, 0, most)).astype(np.int64))
 
 
 def _touched_sectors(grid: RadialGrid, corners: np.ndarray) -> tuple[np.ndarray, bool]:

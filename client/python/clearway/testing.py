@@ -15,7 +15,6 @@ drive, and `next_or_stale` raises `clearway.ReplayEnded`.
 from __future__ import annotations
 
 import json
-import math
 import os
 import subprocess
 import tempfile
@@ -34,6 +33,8 @@ from .v1 import Stub, replay_pb2
 TOWN = Path(__file__).resolve().parent / "golden" / "town.mcap"
 #: Longest wait for the server, in seconds; ours, ten times what a loaded machine needs.
 PATIENCE_S = 60.0
+#: Longest seek, in seconds: stamps have 64 bits of nanoseconds.
+_SEEK_S_MAX = 1e9
 
 
 class ReplayState(NamedTuple):
@@ -114,13 +115,16 @@ class Replay:
 
     def step(self, maps: int = 1) -> ReplayState:
         """Makes so many maps, and pauses; returns when they are made."""
+        if not 0 <= maps < 1 << 32:
+            raise clearway.ClearwayError("INVALID_ARGUMENT", f"step {maps} maps: 0 to {(1 << 32) - 1} are allowed")
         return self._control(step=maps)
 
     def seek(self, seconds: float) -> ReplayState:
         """Goes to a time after the first event; the newest map of that moment is published at once. A paused replay
         stays paused there, one that has ended plays on."""
-        if not math.isfinite(seconds):
-            raise clearway.ClearwayError("INVALID_ARGUMENT", f"seek {seconds} s: a finite number is allowed")
+        if not abs(seconds) < _SEEK_S_MAX:
+            text = f"seek {seconds} s: a number under {_SEEK_S_MAX:.0e} is allowed"
+            raise clearway.ClearwayError("INVALID_ARGUMENT", text)
         return self._control(seek_ns=self._begin_ns() + round(seconds * 1e9))
 
     def speed(self, factor: float) -> ReplayState:

@@ -83,3 +83,16 @@ def test_the_clearance_is_the_distance_to_the_nearest_cell_that_is_not_free():
         nearest = np.hypot(places[:, 0] - x, places[:, 1] - y).min()
         border = (min(ix, layer.grid.width - 1 - ix, iy, layer.grid.height - 1 - iy) + 0.5) * layer.grid.cell_m
         assert clearance[iy, ix] == pytest.approx(0.0 if not layer.free[iy, ix] else min(nearest, border))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("far_m", [1e18, 1e155, 1.7e308])
+@pytest.mark.parametrize("name", ["turned", "squares", "rings"])
+def test_places_as_far_as_numbers_reach_are_answered_and_never_free(name, far_m):
+    layer = clearway.Map(bytes.fromhex(GOLDEN["map"]))[name]
+    assert layer.answer([(far_m, far_m), (far_m, 0.0), (0.0, far_m)]).verdict == "blocked"
+    assert layer.answer([(-far_m, -far_m), (far_m, 0.0), (0.0, far_m)]).verdict == "blocked"
+    assert layer.class_at(far_m, -far_m) == "unknown"
+    assert layer.along(clearway.Arc(0.0, 5.0), clearway.Outline(far_m, far_m, far_m)).blocked is not None
+    if name != "rings":
+        assert (layer.clearance(far_m) == layer.clearance(1e6)).all()

@@ -4,6 +4,7 @@ import json
 import logging
 import socket
 from concurrent import futures
+from contextlib import contextmanager
 from pathlib import Path
 
 import grpc
@@ -47,6 +48,19 @@ class Server:
         yield update(4 * self.streams)
 
 
+@contextmanager
+def serving(watch, address):
+    """A server whose streams are made by `watch`; its port."""
+    server = grpc.server(futures.ThreadPoolExecutor(2))
+    received, sent = service_pb2.WatchRequest.FromString, service_pb2.MapUpdate.SerializeToString
+    methods = {"Watch": grpc.stream_stream_rpc_method_handler(watch, received, sent)}
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("clearway.v1.MapService", methods)])
+    port = server.add_insecure_port(address)
+    server.start()
+    yield port
+    server.stop(None)
+
+
 def test_a_stream_waits_for_its_server_and_is_opened_again_until_it_is_refused(caplog):
     with socket.create_server(("127.0.0.1", 0)) as chosen:
         address = f"127.0.0.1:{chosen.getsockname()[1]}"
@@ -56,18 +70,21 @@ def test_a_stream_waits_for_its_server_and_is_opened_again_until_it_is_refused(c
         while not maps.reasons:
             pass
         assert address in maps.reasons[0]
-        server = grpc.server(futures.ThreadPoolExecutor(2))
-        received, sent = service_pb2.WatchRequest.FromString, service_pb2.MapUpdate.SerializeToString
-        methods = {"Watch": grpc.stream_stream_rpc_method_handler(Server().Watch, received, sent)}
-        server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("clearway.v1.MapService", methods)])
-        server.add_insecure_port(address)
-        server.start()
-        first, second = next(maps), next(maps)
-        assert (first.sequence, first.skipped, second.sequence, second.skipped) == (4, 0, 8, 3)
-        with pytest.raises(clearway.ClearwayError, match="the role is lost"):
-            next(maps)
+        with serving(Server().Watch, address):
+            first, second = next(maps), next(maps)
+            assert (first.sequence, first.skipped, second.sequence, second.skipped) == (4, 0, 8, 3)
+            with pytest.raises(clearway.ClearwayError, match="the role is lost"):
+                next(maps)
     assert "the server has ended the stream; the stream of maps is opened again" in caplog.text
-    server.stop(None)
+
+
+def test_a_stream_that_is_to_reconnect_ends_at_a_vehicle_that_the_server_does_not_know():
+    def refuse(_, context):
+        context.abort(grpc.StatusCode.NOT_FOUND, "no vehicle 'beta'")
+
+    with serving(refuse, "127.0.0.1:0") as port, clearway.watch(f"127.0.0.1:{port}", "beta", reconnect=True) as maps:
+        with pytest.raises(clearway.ClearwayError, match="no vehicle 'beta'"):
+            next(maps)
 
 
 def test_the_reasons_of_the_server_stay_until_a_map_comes():

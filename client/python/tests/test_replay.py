@@ -41,7 +41,11 @@ def test_a_replay_is_paused_stepped_and_sought(clearway_replay):
             while maps.next_or_stale().stale:
                 pass
         assert next(maps, None) is None
-    for wrong, allowed in [(lambda: drive.seek(99.0), "plays 0.000 s to"), (lambda: drive.speed(0.0), "0.1 to 1000")]:
+    for wrong, allowed in [
+        (lambda: drive.seek(99.0), "plays 0.000 s to"), (lambda: drive.seek(1e300), "seek 1e[+]300 s"),
+        (lambda: drive.seek(math.nan), "seek nan s"), (lambda: drive.step(-1), "step -1 maps"),
+        (lambda: drive.speed(0.0), "0.1 to 1000"),
+    ]:  # fmt: skip
         with pytest.raises(clearway.ClearwayError, match=allowed):
             wrong()
 

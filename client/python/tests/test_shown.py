@@ -176,6 +176,14 @@ def test_a_recording_gives_its_maps_with_all_layers_and_its_plans_in_order(recor
         next(clearway.read_all(recording, "bus"))
 
 
+def test_a_grid_too_far_away_for_numbers_of_cells_is_refused_with_its_place():
+    m = sample(layer(), heading=0.4)
+    m.header.map_from_ego.x = 1e18
+    with pytest.raises(clearway.ClearwayError, match=r"its vehicle at \(1e\+18, -7.7\) m") as refused:
+        m.to_occupancy_grid()
+    assert refused.value.reason == "extent"
+
+
 def test_a_recording_that_is_damaged_anywhere_is_an_error_that_names_it(recording):
     sound, random = recording.read_bytes(), np.random.default_rng(7)
     truth = [str(m.layers) if isinstance(m, clearway.Map) else m for m in clearway.read_all(recording)]
