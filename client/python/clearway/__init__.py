@@ -9,6 +9,7 @@ An address is `HOST:PORT` for gRPC, or `zenoh:ENDPOINT` (`zenoh:tcp/localhost:74
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from os import PathLike
 
@@ -128,4 +129,9 @@ def _zenoh(address: str, vehicle: str, layers: Sequence[str]) -> str | None:
         return None
     if not vehicle or not layers:
         raise ClearwayError("selection", f"{address}: over zenoh vehicle and layers must be named, such as ['terrain']")
+    for what, name in [("vehicle", vehicle), *(("layer", layer) for layer in layers)]:
+        # Another name is no part of a key, or stands for several.
+        if not re.fullmatch("[a-z0-9_-]{1,64}", name):
+            text = f"{what} {name!r}: 1 to 64 of the characters a-z, 0-9, - and _ are allowed"
+            raise ClearwayError("selection", f"{address}: {text}")
     return address.removeprefix("zenoh:")

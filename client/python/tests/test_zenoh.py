@@ -93,6 +93,15 @@ def test_a_name_that_no_server_publishes_is_named_with_those_that_are_published(
             assert reasons(maps) == ["no server publishes the vehicle 'alfa' now; published: alpha"]
 
 
+@pytest.mark.parametrize("call", [clearway.watch, clearway.get])
+@pytest.mark.parametrize("names", [("*", "speed"), ("car$*", "speed"), ("a/b", "speed"), ("Car", "speed"), ("car", "**")])
+def test_a_name_that_is_no_name_is_refused_before_anything_is_opened(call, names):
+    wrong = next(name for name in names if not name.isalpha() or not name.islower())
+    with pytest.raises(clearway.ClearwayError, match="1 to 64 of the characters a-z, 0-9, - and _") as refused:
+        call("zenoh:tcp/127.0.0.1:1", vehicle=names[0], layers=[names[1]])
+    assert repr(wrong) in str(refused.value)
+
+
 def test_a_stream_that_is_to_reconnect_waits_for_a_router_at_the_start(endpoint):
     with pytest.raises(clearway.ClearwayError, match="PROTOCOL/HOST:PORT is allowed"):
         clearway.watch("zenoh:localhost:7447", vehicle="alpha", layers="drivability")
