@@ -128,7 +128,7 @@ inline bool is_lasting(const Error& ended) {
     return std::find(std::begin(REASONS), std::end(REASONS), ended.reason()) != std::end(REASONS);
 }
 
-// True if a map replaces the newest one: it is of another run, later in this one, or the run has begun anew in it.
+// True if a map replaces the newest one: it is of another run, later in this one, or the run has begun again in it.
 inline bool replaces(const Map& map, const Map& newest, Clocks now) {
     if (newest.header.boot_id != map.header.boot_id || map.header.sequence > newest.header.sequence) return true;
     const std::int64_t end_ns = newest.header.capture_end_ns;
@@ -188,7 +188,7 @@ public:
     }
 
     // Maps between the last two: skipped because the reader, its link or its connection was slow or away, and left out
-    // by `max_rate_hz`. 0 if the server has started again between, or the run has begun anew.
+    // by `max_rate_hz`. 0 if the server has started again between, or the run has begun again.
     std::uint64_t skipped() const { return skipped_; }
     std::uint64_t left_out() const { return left_out_; }
 
