@@ -97,6 +97,14 @@ pub enum ClientError {
         /// What is wrong with it, and what is allowed.
         reason: String,
     },
+    /// A name is none of a vehicle or layer.
+    #[error("{what} {name:?}: 1 to 64 of the characters a-z, 0-9, - and _ are allowed")]
+    Name {
+        /// `vehicle` or `layer`.
+        what: &'static str,
+        /// The name as given.
+        name: String,
+    },
     /// A zenoh operation failed.
     #[error("zenoh, {what}: {reason}")]
     Zenoh {

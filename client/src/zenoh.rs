@@ -178,7 +178,7 @@ impl ZenohClient {
     /// # Errors
     /// [`ClientError::Zenoh`] if the query fails, [`ClientError::Map`] if there are answers and none is a valid map.
     pub async fn newest(&self, vehicle: &str, layer: &str) -> Result<Option<MapView>, ClientError> {
-        LayerKey::new(vehicle, layer, self.signed_by.clone()).newest(&self.session).await
+        LayerKey::new(vehicle, layer, self.signed_by.clone())?.newest(&self.session).await
     }
 
     /// Streams one layer of one vehicle, starting with the newest map if there is one. The stream does not end with the
@@ -187,9 +187,9 @@ impl ZenohClient {
     /// counted ([`MapStream::passed_over`]).
     ///
     /// # Errors
-    /// [`ClientError::Zenoh`] if the subscription fails.
+    /// [`ClientError::Name`] if a name is not allowed, [`ClientError::Zenoh`] if the subscription fails.
     pub async fn subscribe(&self, vehicle: &str, layer: &str) -> Result<MapStream, ClientError> {
-        let layer = LayerKey::new(vehicle, layer, self.signed_by.clone());
+        let layer = LayerKey::new(vehicle, layer, self.signed_by.clone())?;
         let (slot, key) = (LatestSlot::new(Clock::default()), layer.key.clone());
         let subscription = LayerSubscription::open(&self.session, layer.clone(), slot.clone()).await;
         let subscription = subscription.map_err(failed(format!("subscribe to {key}")))?;

@@ -79,8 +79,8 @@ def poses_of(path: Arc | Sequence[Point], outline: Outline) -> list[Pose]:
     """Poses of a vehicle, each at most 0.1 m from the one before and turned by so little that its farthest corner moves
     at most as far by that; with both ends. At a place between two stretches the vehicle turns the shorter way, to the
     left if both are equal."""
-    make = _arc_poses if isinstance(path, Arc) else _straight_poses
-    return make(path, outline.reach_m())
+    reach_m = outline.reach_m()
+    return _arc_poses(path, reach_m) if isinstance(path, Arc) else _straight_poses(path, reach_m)
 
 
 def finite(what: str, value: float) -> float:

@@ -37,9 +37,19 @@ pub(super) struct LayerKey {
 }
 
 impl LayerKey {
-    pub fn new(vehicle: &str, layer: &str, signed_by: Option<PublicKey>) -> Self {
+    /// The key of a layer of a vehicle.
+    ///
+    /// # Errors
+    /// [`ClientError::Name`]: in a key the characters `*`, `$` and `/` would ask for other vehicles or for none.
+    pub fn new(vehicle: &str, layer: &str, signed_by: Option<PublicKey>) -> Result<Self, ClientError> {
+        let is_allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-' || c == '_';
+        for (what, name) in [("vehicle", vehicle), ("layer", layer)] {
+            if !(1..=64).contains(&name.len()) || !name.chars().all(is_allowed) {
+                return Err(ClientError::Name { what, name: name.to_owned() });
+            }
+        }
         let key = format!("clearway/{vehicle}/map/{layer}");
-        Self { key, vehicle: vehicle.into(), layer: layer.into(), signed_by }
+        Ok(Self { key, vehicle: vehicle.into(), layer: layer.into(), signed_by })
     }
 
     /// Decodes the map of a sample.
@@ -128,4 +138,18 @@ pub(super) async fn published(session: &Session, keys: &str, place: usize) -> Re
 
 fn undecodable(passed: &mut crate::stream::PassedOver) -> &mut u64 {
     &mut passed.undecodable
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_that_would_ask_for_other_vehicles_is_refused_with_what_is_allowed() {
+        assert!(LayerKey::new("car-2", "safe_path", None).is_ok());
+        for (vehicle, layer) in [("*", "freespace"), ("car$*", "freespace"), ("a/b", "freespace"), ("car", "")] {
+            let error = LayerKey::new(vehicle, layer, None).err().expect("it is refused").to_string();
+            assert!(error.ends_with(": 1 to 64 of the characters a-z, 0-9, - and _ are allowed"), "{error}");
+        }
+    }
 }

@@ -2,6 +2,7 @@
 
 use std::future::pending;
 use std::io::IsTerminal;
+use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -12,9 +13,9 @@ use clearway_mapping::config::Extrinsics;
 use clearway_replay::player::faults::Fault;
 use clearway_replay::summary::why_no_map;
 use clearway_replay::{ReplayOptions, ReplayRun, ReplaySpeed, ReplaySummary, ServedReplay, describe};
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use tokio::io::AsyncReadExt;
 use tokio::net::unix::pipe;
-use tokio::time::timeout;
 
 use crate::cli::shared::configuration::extrinsics;
 use crate::cli::shared::exit::Exit;
@@ -130,8 +131,6 @@ impl From<ServedArguments> for ServedReplay {
     }
 }
 
-/// A pipe that is closed within this time was closed when the command began. Ours.
-const STDIN_CLOSED_MAX: Duration = Duration::from_millis(100);
 /// Greatest number of seconds, about 30 years. Ours.
 const SECONDS_MAX: f64 = 1e9;
 
@@ -163,7 +162,8 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     }
     let ReplayArguments { model, topics, config, set, faults, serve, served, .. } = arguments;
     let served: Option<ServedReplay> = serve.then(|| served.into());
-    let is_of_program = served.as_ref().is_some_and(|served| served.ready_file.is_some());
+    // Under cron stdin is a pipe that was closed from the start.
+    let is_of_program = served.as_ref().is_some_and(|served| served.ready_file.is_some()) && !is_stdin_closed();
     let has_bar = !json && !serve && std::io::stderr().is_terminal();
     let options = ReplayOptions {
         files,
@@ -212,15 +212,19 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
 }
 
-/// Returns when the pipe that is stdin is closed, if that `ends` the command; never if stdin is no pipe, or a pipe that
-/// was closed from the start, as under cron.
+/// True if nobody holds the other end of the pipe that is stdin.
+fn is_stdin_closed() -> bool {
+    let stdin = std::io::stdin();
+    let mut asked = [PollFd::new(stdin.as_fd(), PollFlags::empty())];
+    let is_answered = poll(&mut asked, PollTimeout::ZERO).is_ok();
+    is_answered && asked[0].revents().is_some_and(|events| events.contains(PollFlags::POLLHUP))
+}
+
+/// Returns when the pipe that is stdin is closed, if that `ends` the command; never if stdin is no pipe.
 async fn stdin_closed(ends: bool) {
     let stdin = pipe::OpenOptions::new().open_receiver("/dev/stdin").ok().filter(|_| ends);
     let Some(mut stdin) = stdin else { return pending().await };
     let mut ignored = [0; 64];
-    if timeout(STDIN_CLOSED_MAX, stdin.read(&mut ignored)).await.is_ok_and(|read| !matches!(read, Ok(1..))) {
-        return pending().await;
-    }
     while matches!(stdin.read(&mut ignored).await, Ok(1..)) {}
 }
 
