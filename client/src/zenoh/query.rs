@@ -148,7 +148,8 @@ mod tests {
     fn a_name_that_would_ask_for_other_vehicles_is_refused_with_what_is_allowed() {
         assert!(LayerKey::new("car-2", "safe_path", None).is_ok());
         for (vehicle, layer) in [("*", "freespace"), ("car$*", "freespace"), ("a/b", "freespace"), ("car", "")] {
-            let error = LayerKey::new(vehicle, layer, None).err().expect("it is refused").to_string();
+            let Err(error) = LayerKey::new(vehicle, layer, None) else { panic!("{vehicle}/{layer}") };
+            let error = error.to_string();
             assert!(error.ends_with(": 1 to 64 of the characters a-z, 0-9, - and _ are allowed"), "{error}");
         }
     }

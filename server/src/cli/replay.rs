@@ -212,7 +212,7 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
 }
 
-/// True if nobody holds the other end of the pipe that is stdin.
+/// True if stdin is a pipe that no process writes to.
 fn is_stdin_closed() -> bool {
     let stdin = std::io::stdin();
     let mut asked = [PollFd::new(stdin.as_fd(), PollFlags::empty())];

@@ -39,7 +39,7 @@ pub(super) async fn connect(settings: zenoh::Config, users: Users, connected: Co
         tokio::time::sleep(PERIOD).await;
     };
     match OverZenoh::start(session, &users).await {
-        Ok(over_zenoh) => connected.lock().await.over_zenoh = Some(over_zenoh),
+        Ok(over_zenoh) => *connected.lock().await = Connection { over_zenoh: Some(over_zenoh), failure: String::new() },
         Err(error) => tracing::error!(%error, "no maps over zenoh"),
     }
 }

@@ -117,3 +117,22 @@ pub enum ShutdownError {
     #[error("the end of engines and recorder is unknown: {0}")]
     Task(#[from] tokio::task::JoinError),
 }
+
+/// Comments of a configuration as its first lines. A comment may quote a name of the input, and ends with its line, so
+/// that control characters are escaped.
+pub(super) fn comment_lines(comments: &[String]) -> String {
+    let shown = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    let line = |comment: &String| format!("# {}\n", comment.chars().map(shown).collect::<String>());
+    comments.iter().map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_comment_that_quotes_line_breaks_stays_one_comment() {
+        let comment = "of velo\r\n[grpc]\nenabled = false\t\u{85}".to_owned();
+        assert_eq!(comment_lines(&[comment]), "# of velo\\r\\n[grpc]\\nenabled = false\\t\\u{85}\n");
+    }
+}

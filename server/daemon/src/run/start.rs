@@ -21,7 +21,7 @@ use super::over_zenoh::{OverZenoh, Users};
 use super::router;
 use super::running::Running;
 use super::save_rules;
-use super::setup::{Setup, StartError};
+use super::setup::{Setup, StartError, comment_lines};
 #[cfg(feature = "store")]
 use super::uploads;
 use crate::base::clock::now_ns;
@@ -423,12 +423,14 @@ fn header(
             }
         }
     }
-    // A comment may quote a name of the input, and a comment ends with its line.
-    let shown = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
-    let line = |comment: &String| format!("# {}\n", comment.chars().map(shown).collect::<String>());
-    let comments: String = config_comments.iter().map(line).collect();
     let vehicles = config.vehicles.iter().map(|v| (v.name.as_str().into(), layer_names(&v.maps))).collect();
-    Header { boot_id, config: comments + &config.to_toml(), vehicles, calibrations: tables, metadata }
+    Header {
+        boot_id,
+        config: comment_lines(config_comments) + &config.to_toml(),
+        vehicles,
+        calibrations: tables,
+        metadata,
+    }
 }
 
 /// A random 64-bit number: the system seeds each `RandomState` with its randomness.
@@ -439,7 +441,6 @@ pub fn random() -> u64 {
 #[cfg(test)]
 mod tests {
     use std::future::pending;
-    use std::path::Path;
 
     use super::*;
 
@@ -447,14 +448,6 @@ mod tests {
         while !condition() {
             tokio::task::yield_now().await;
         }
-    }
-
-    #[test]
-    fn a_comment_that_quotes_line_breaks_stays_one_comment() {
-        let (config, comment) = (Config::of_one_vehicle("car", "top"), "of velo\r\n[grpc]\nenabled = false\t\u{85}");
-        let text = header(&config, &[], 1, &[comment.to_owned()], BTreeMap::new()).config;
-        assert_eq!(text.lines().next(), Some("# of velo\\r\\n[grpc]\\nenabled = false\\t\\u{85}"));
-        assert_eq!(Config::parse(&text, Path::new("config.toml"), &[]).unwrap().grpc, config.grpc);
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
