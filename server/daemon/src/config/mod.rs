@@ -300,7 +300,7 @@ impl Config {
         self.grpc.check()?;
         self.page.check()?;
         self.connections.check()?;
-        self.recorder.check()?;
+        self.recorder.check(self.vehicles.iter().any(|vehicle| vehicle.maps.memory.enabled))?;
         self.store.check()?;
         self.traces.check()?;
         self.zenoh.check(&self.vehicles)?;

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clearway_journal::RecordedMaps;
+use clearway_mapping::memory::config::GROUND_S_MAX;
 use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
@@ -23,9 +24,7 @@ pub struct Recorder {
     pub part_mb: u64,
     /// Time in seconds after which the next part begins; 0: no limit.
     pub part_s: u64,
-    /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded. A
-    /// constant but in tests. Ours: layers remember less, and `vehicle.maps.memory` keeps ground for half of it.
-    #[serde(skip)]
+    /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded.
     pub warm_up_ms: u64,
     /// Total length in MiB beyond which the oldest parts are deleted; 0: none is.
     pub keep_mb: u64,
@@ -87,11 +86,13 @@ impl Default for Recorder {
 }
 
 impl Recorder {
-    pub(super) fn check(&self) -> Result<(), ValueError> {
+    /// `remembers` is true if a vehicle has a memory of ground.
+    pub(super) fn check(&self, remembers: bool) -> Result<(), ValueError> {
         let ranges = [
             ("recorder.flush_ms", self.flush_ms, 10..=60_000, "10 to 60000 ms"),
             ("recorder.part_mb", self.part_mb, 0..=1 << 20, "0 to 1048576 MiB"),
             ("recorder.part_s", self.part_s, 0..=86_400, "0 to 86400 s"),
+            ("recorder.warm_up_ms", self.warm_up_ms, 100..=600_000, "100 to 600000 ms"),
             ("recorder.keep_mb", self.keep_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
             ("recorder.keep_hours", self.keep_hours, 0..=876_000, "0 to 876000 h"),
             ("recorder.saved_mb", self.saved_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
@@ -101,6 +102,11 @@ impl Recorder {
             if !allowed.contains(&value) {
                 return Err(ValueError::new(key, value, text));
             }
+        }
+        // Else each new part would change the maps: its pipeline would remember less ground.
+        if remembers && !self.file.as_os_str().is_empty() && (self.warm_up_ms as f32) < 1e3 * GROUND_S_MAX {
+            let allowed = format!("at least the {GROUND_S_MAX} s for which vehicle.maps.memory keeps ground");
+            return Err(ValueError::new("recorder.warm_up_ms", self.warm_up_ms, allowed));
         }
         Ok(())
     }

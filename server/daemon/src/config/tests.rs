@@ -187,6 +187,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         ("[[vehicle]]", "[store]\nurl = \"ftp://a/b\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
         ("[[vehicle]]", "[store]\nurl = \"s3:///prefix\"\n[[vehicle]]", "s3://BUCKET/PREFIX"),
         ("[[vehicle]]", "[store]\nurl = \"file://mnt\"\n[[vehicle]]", "file:///FOLDER"),
+        ("[[vehicle]]", "[recorder]\nfile = \"a\"\nwarm_up_ms = 500\n[[vehicle]]", "at least the 5 s"),
     ];
     for (from, to, allowed) in wrong {
         let error = error(&NEEDED.replacen(from, to, 1));

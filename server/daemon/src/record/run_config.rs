@@ -128,9 +128,8 @@ const CONSTANTS: [(&str, &str, &str); 67] = [
 ];
 
 /// Keys of other tables that earlier versions had. They changed no map that is computed again.
-const REMOVED: [(&str, &str); 12] = [
+const REMOVED: [(&str, &str); 11] = [
     ("recorder", "queue"),
-    ("recorder", "warm_up_ms"),
     ("grpc", "connections_max"),
     ("page", "connections_max"),
     ("connections", "kept"),

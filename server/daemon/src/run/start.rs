@@ -424,13 +424,8 @@ fn header(
         }
     }
     let vehicles = config.vehicles.iter().map(|v| (v.name.as_str().into(), layer_names(&v.maps))).collect();
-    Header {
-        boot_id,
-        config: comment_lines(config_comments) + &config.to_toml(),
-        vehicles,
-        calibrations: tables,
-        metadata,
-    }
+    let config = comment_lines(config_comments) + &config.to_toml();
+    Header { boot_id, config, vehicles, calibrations: tables, metadata }
 }
 
 /// A random 64-bit number: the system seeds each `RandomState` with its randomness.
