@@ -23,7 +23,7 @@ WIRE_VERSION = 1
 
 def count_parts(message: bytes, is_map: bool = True) -> int:
     """Number of layers, channels, planes, sensors and names that an encoded map claims to have, counted before any is
-    made: its length-delimited fields, and those of its header and layers. Stops above `MAP_PARTS_MAX`, and where the
+    made: the length-delimited fields of the map, its header and its layers. Stops above `MAP_PARTS_MAX`, and where the
     bytes are no protobuf, which the decoder then names."""
     parts = at = 0
 

@@ -195,7 +195,7 @@ async fn the_grid_of_a_sensor_that_stops_becomes_unknown_once_and_a_late_subscri
         let (stamp_ns, known) = next(subscriber).await;
         assert!(known && stamp_ns > known_ns, "the unknown grid came once");
     }
-    // No subscriber hears that the next map becomes stale, but the cache answers one that comes then.
+    // The next map becomes stale without a subscriber, and the cache answers whichever subscriber comes then.
     for subscriber in [first, late] {
         subscriber.undeclare().await.unwrap();
     }
