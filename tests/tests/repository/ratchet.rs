@@ -134,22 +134,28 @@ fn long_pages() -> Values {
     all.iter().map(|file| (shown(file), words(file))).filter(|(_, words)| *words > WORDS_MAX).collect()
 }
 
-/// Long options and configuration keys.
+/// Long options of each subcommand, with its verbs' (`recorder stop --json` is `recorder --json`), and default keys.
 fn counts() -> Values {
     let completions = clearway_tests::run(&workspace(), "clearway", &["completions", "fish"]);
     let completions = String::from_utf8(completions.stdout).expect("UTF-8");
-    let options = completions.lines().filter(|line| line.contains(" -l ") && !line.contains(" -l help"));
-    let read = |file: &str| fs::read_to_string(workspace().join(file)).expect("UTF-8");
-    // Names of a token and of a sensor stand where keys do.
+    let options: BTreeSet<_> =
+        completions.lines().filter_map(long_option).filter(|(_, name)| *name != "help").collect();
+    let defaults = fs::read_to_string(workspace().join("deploy/clearway.toml")).expect("UTF-8");
     let is_key = |line: &&str| {
-        let line = line.trim_start_matches(['#', ' ']);
         let is_word = |key: &str| key.chars().all(|c| c.is_ascii_lowercase() || c == '_');
-        line.split_once(" = ").is_some_and(|(key, _)| is_word(key) && !["prometheus", "top"].contains(&key))
+        line.split_once(" = ").is_some_and(|(key, _)| is_word(key))
     };
     Values::from([
-        ("long options of all subcommands".to_owned(), options.count()),
-        ("keys of deploy/clearway.toml".to_owned(), read("deploy/clearway.toml").lines().filter(is_key).count()),
+        ("long options of all subcommands".to_owned(), options.len()),
+        ("keys of deploy/clearway.toml with a default".to_owned(), defaults.lines().filter(is_key).count()),
     ])
+}
+
+/// The subcommand and the name of the long option that a line of fish's completions declares.
+fn long_option(line: &str) -> Option<(&str, &str)> {
+    let (condition, option) = line.split_once(" -l ")?;
+    let subcommand = condition.split_once("__fish_clearway_using_subcommand ").map_or("", |(_, rest)| rest);
+    Some((subcommand.split([' ', ';', '"']).next()?, option.split(' ').next()?))
 }
 
 /// Compares a section with today's values; an entry that is not in the file may not be there at all, unless it is one
