@@ -253,7 +253,7 @@ async fn attacked() -> (AdvancedPublisher<'static>, Session, MapStream, Session)
 async fn passed_over(maps: &MapStream, count: impl Fn(PassedOver) -> u64, expected: u64) {
     let counted = async {
         while count(maps.passed_over()) < expected {
-            tokio::task::yield_now().await;
+            tokio::time::sleep(std::time::Duration::from_millis(2)).await;
         }
     };
     let waited = tokio::time::timeout(std::time::Duration::from_secs(60), counted).await;

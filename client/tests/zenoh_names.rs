@@ -18,7 +18,7 @@ async fn a_reader_that_waits_for_a_name_that_no_server_publishes_learns_which_ar
         let maps = client.subscribe(vehicle, layer).await.unwrap();
         let mut reasons = maps.reasons();
         while reasons.is_empty() {
-            tokio::task::yield_now().await;
+            tokio::time::sleep(std::time::Duration::from_millis(2)).await;
             reasons = maps.reasons();
         }
         assert_eq!(reasons, [why]);

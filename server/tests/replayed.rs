@@ -26,7 +26,7 @@ fn started(folder: &Path, options: &[&str]) -> (Child, String) {
         .unwrap();
     while !ready.exists() {
         assert_eq!(server.try_wait().unwrap(), None, "the server is there");
-        std::thread::yield_now();
+        std::thread::sleep(std::time::Duration::from_millis(2));
     }
     let addresses: serde_json::Value = serde_json::from_slice(&std::fs::read(ready).unwrap()).unwrap();
     (server, addresses["grpc"].as_str().unwrap().to_owned())

@@ -63,7 +63,7 @@ impl Server {
         let client = loop {
             match Client::connect(&self.grpc.to_string()).await {
                 Ok(client) => break client,
-                Err(_) => tokio::task::yield_now().await,
+                Err(_) => tokio::time::sleep(Duration::from_millis(2)).await,
             }
         };
         client.subscribe(Subscription { layers: vec!["drivability".into()], ..Subscription::default() }).await.unwrap()

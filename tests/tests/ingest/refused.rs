@@ -14,7 +14,7 @@ use prost::Message;
 use tonic::Code;
 
 use super::{client, ingester, plain, reports, scan, scanned_config, start};
-use crate::fixture::{recorded, within};
+use crate::fixture::{before_another_look, recorded, within};
 
 /// `scan` with the x of its last point replaced.
 fn with_last_x(scan: v1::Scan, last: f32) -> v1::Scan {
@@ -168,7 +168,7 @@ async fn a_scan_that_is_too_large_is_refused_and_one_sender_never_has_all_stream
             match client.ingest("car").await {
                 Ok(stream) => held.push(stream),
                 // The stream before may not have ended yet.
-                Err(_) if held.len() < 2 => tokio::task::yield_now().await,
+                Err(_) if held.len() < 2 => before_another_look().await,
                 Err(error) => return (held, error.to_string()),
             }
         }
@@ -218,7 +218,7 @@ async fn unknown_vehicles_surplus_streams_and_large_scans_are_refused() {
             match client.ingest("car").await {
                 Ok(ingester) => return ingester,
                 // The stream before may not have ended yet.
-                Err(ClientError::Refused { .. }) => tokio::task::yield_now().await,
+                Err(ClientError::Refused { .. }) => before_another_look().await,
                 Err(other) => panic!("{other}"),
             }
         }
@@ -230,7 +230,7 @@ async fn unknown_vehicles_surplus_streams_and_large_scans_are_refused() {
             let hello = v1::Observation::default();
             let (reports, end) = reports(&running, vec![hello, scan(1, giant.clone())]).await;
             match end {
-                Some(status) if status.code() == Code::ResourceExhausted => tokio::task::yield_now().await,
+                Some(status) if status.code() == Code::ResourceExhausted => before_another_look().await,
                 end => return (reports, end),
             }
         }

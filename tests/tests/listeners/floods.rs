@@ -9,7 +9,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use super::{everything, metric};
-use crate::fixture::{self, feed, readings, start, within};
+use crate::fixture::{self, before_another_look, feed, readings, start, within};
 
 /// Sends a flood until the server closes the connection.
 async fn flood(mut stream: TcpStream, bytes: &[u8]) {
@@ -64,7 +64,7 @@ async fn counted_once(running: &Running, reason: &str) {
     let line = format!("clearway_connections_closed_total{{listener=\"grpc\",reason=\"{reason}\"}}");
     within("the connection is counted", async {
         while metric(running, &line).await == 0.0 {
-            tokio::task::yield_now().await;
+            before_another_look().await;
         }
     })
     .await;
@@ -156,7 +156,7 @@ async fn a_browsers_new_selection_ends_the_one_before_it_also_while_the_browser_
     stream.write_all(&masked(1, br#"{"type":"unwatch","vehicle":"car"}"#)).await.unwrap();
     within("no reader is left", async {
         while metric(&running, readers).await > 0.0 {
-            tokio::task::yield_now().await;
+            before_another_look().await;
         }
     })
     .await;

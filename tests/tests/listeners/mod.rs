@@ -20,7 +20,7 @@ use clearway_tests::attack::sockets::{OPENINGS, Opening, closed, hold};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use crate::fixture::{self, feed, grpc, readings, selection, sequence, start, within};
+use crate::fixture::{self, before_another_look, feed, grpc, readings, selection, sequence, start, within};
 
 /// A server with every TCP listener.
 pub fn everything() -> Config {
@@ -153,7 +153,7 @@ async fn streams_that_are_never_read_are_limited_and_cost_a_healthy_reader_no_ma
     let calls = "clearway_connections_closed_total{listener=\"grpc\",reason=\"calls\"}";
     within("1,745 streams are refused", async {
         while metric(&running, calls).await < 1745.0 {
-            tokio::task::yield_now().await;
+            before_another_look().await;
         }
     })
     .await;

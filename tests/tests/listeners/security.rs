@@ -15,7 +15,7 @@ use tokio::net::TcpStream;
 use zenoh::qos::CongestionControl;
 
 use crate::fixture::certificates::{behind, certificates, router, secured, start, zenoh_file};
-use crate::fixture::{self, config, feed, grpc, readings, until, within};
+use crate::fixture::{self, before_another_look, config, feed, grpc, readings, until, within};
 
 fn tls(ca: &str, identity: Option<(&str, &str)>) -> Tls {
     let read = |folder: &Path, file: String| std::fs::read_to_string(folder.join(file)).expect("a certificate");
@@ -332,7 +332,7 @@ async fn what_a_peer_publishes_on_a_wildcard_over_the_servers_keys_reaches_no_su
     within("the server routes to the observer", async {
         while let Ok(None) = seen.try_recv() {
             attacker.put(others, "of another vehicle").await.unwrap();
-            tokio::task::yield_now().await;
+            before_another_look().await;
         }
     })
     .await;

@@ -6,7 +6,7 @@ use clearway_daemon::config::ZenohMode;
 use clearway_daemon::run::Running;
 
 use crate::fixture::routers::router;
-use crate::fixture::{config, feed, readings, start, until, within};
+use crate::fixture::{before_another_look, config, feed, readings, start, until, within};
 
 /// A server with one vehicle of this name, behind a router, with one map.
 async fn server(vehicle: &str, router: &str) -> Running {
@@ -55,7 +55,7 @@ async fn listed(client: &Client) -> Vec<String> {
 async fn lists(client: &Client, expected: &[&str]) {
     within(&format!("a list of {expected:?}"), async {
         while listed(client).await != expected {
-            tokio::task::yield_now().await;
+            before_another_look().await;
         }
     })
     .await;

@@ -7,7 +7,7 @@ use clearway_daemon::run::{Server, Setup};
 use clearway_proto::v1;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
-use crate::fixture::{Driving, config, feed, grpc, readings, start, within};
+use crate::fixture::{Driving, before_another_look, config, feed, grpc, readings, start, within};
 
 /// Sends a plain HTTP request; returns its status line and its body.
 async fn ask(address: std::net::SocketAddr, path: &str) -> (String, String) {
@@ -199,7 +199,7 @@ impl Prometheus {
                 if alerts.map(is_firing) == Some(fires) {
                     break;
                 }
-                tokio::task::yield_now().await;
+                before_another_look().await;
             }
         })
         .await;

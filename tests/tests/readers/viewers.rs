@@ -22,7 +22,7 @@ use zenoh::query::ReplyKeyExpr;
 use zenoh::sample::Sample;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig};
 
-use crate::fixture::{LAYERS, config, feed, readings, start, venv, within};
+use crate::fixture::{LAYERS, before_another_look, config, feed, readings, start, venv, within};
 
 /// A pose that heads north-east.
 fn pose() -> Isometry3<f64> {
@@ -202,7 +202,7 @@ async fn the_grid_of_a_sensor_that_stops_becomes_unknown_once_and_a_late_subscri
     let has_reader = || running.vehicles.0[0].status.transports.count(Transport::Ros) > 0;
     within("no reader", async {
         while has_reader() {
-            tokio::task::yield_now().await
+            before_another_look().await
         }
     })
     .await;

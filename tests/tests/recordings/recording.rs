@@ -264,7 +264,7 @@ fn drive_until(file: &Path, bytes: u64, data: SocketAddr) {
         if file.metadata().is_ok_and(|metadata| metadata.len() > bytes) {
             return;
         }
-        std::thread::yield_now();
+        std::thread::sleep(std::time::Duration::from_millis(2));
     }
 }
 

@@ -16,7 +16,7 @@ use clearway_replay::{ReplayError, ReplayOptions, ReplayRun, ReplaySummary, Serv
 use prost::Message;
 use tonic::transport::Channel;
 
-use crate::fixture::{self, within};
+use crate::fixture::{self, before_another_look, within};
 
 /// A recorded drive of this many tenths of a second, one map each, with ego poses, with memory, and with a plan after
 /// half a second and after one and a half.
@@ -421,7 +421,7 @@ async fn in_lockstep_the_next_map_is_made_when_the_client_has_handled_the_last()
         let mut stream = client.subscribe(Subscription::default()).await.unwrap();
         let first = stream.next().await.unwrap().map.sequence();
         while stream.ended().is_none() {
-            tokio::task::yield_now().await;
+            before_another_look().await;
         }
         assert_eq!((first, stream.newest().unwrap().sequence()), (0, 0));
     })

@@ -441,7 +441,7 @@ mod tests {
 
     async fn until(condition: impl Fn() -> bool) {
         while !condition() {
-            tokio::task::yield_now().await;
+            tokio::time::sleep(std::time::Duration::from_millis(2)).await;
         }
     }
 
