@@ -61,7 +61,7 @@ pub fn check(region: &v1::Region) -> Result<(), RegionError> {
 pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v1::Layer, RegionError> {
     check(region)?;
     let decoded = decode_layer(layer.clone(), None, limits)?;
-    let part = Part::of(&decoded.grid, region).ok_or_else(|| RegionError::Outside {
+    let part = GridPart::of(&decoded.grid, region).ok_or_else(|| RegionError::Outside {
         layer: layer.name.clone(),
         region: *region,
         range_m_max: decoded.grid.range_m_max(),
@@ -70,7 +70,7 @@ pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v
     if part.is_all_of(shape) {
         return Ok(layer.clone());
     }
-    let Part { rows, columns, .. } = &part;
+    let GridPart { rows, columns, .. } = &part;
     let mut cropped = layer.clone();
     match &mut cropped.geometry {
         Some(v1::layer::Geometry::Radial(grid)) => grid.row_radius_m.truncate(rows.len()),
@@ -101,7 +101,7 @@ pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v
 type Span = std::ops::Range<usize>;
 
 /// Where a region lies in a grid.
-struct Part {
+struct GridPart {
     /// Rows and columns that are kept.
     rows: Span,
     columns: Span,
@@ -111,7 +111,7 @@ struct Part {
     known_columns: Span,
 }
 
-impl Part {
+impl GridPart {
     /// The smallest part that contains the region; `None` if the region lies outside the grid.
     fn of(grid: &Grid, region: &v1::Region) -> Option<Self> {
         let corners = [region.x_from_m, region.x_to_m].map(|x| [region.y_from_m, region.y_to_m].map(|y| (x, y)));

@@ -8,10 +8,10 @@
 //! | [`config`] | one TOML file -> vehicles, sources, publishers, recorder |
 //! | [`ingest`] | datagrams, observations, ROS 2 messages -> numbered events on one queue a vehicle |
 //! | [`engine`] | events -> journal, step of the pipeline, encoded maps, of the layers that readers want |
-//! | [`encode`] | map -> bytes, once; regions and deltas of them; event <-> bytes of the journal |
+//! | [`encode`] | map -> pictures, clouds and grids of viewers: the page, Foxglove, ROS 2 |
 //! | [`fleet`] | announcements of other servers -> their vehicles, and where they are served |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
-//! | [`record`] | events and maps -> MCAP file, and back; verification |
+//! | [`record`] | events and maps -> MCAP file |
 //! | [`replay_control`] | requests of clients -> commands for a replay; the state of the replay -> clients |
 //! | `store` | finished recordings -> a folder or a bucket, with an index; a search -> recordings |
 //! | [`status`] | ledger, rates and latency of each vehicle |

@@ -10,7 +10,7 @@ use super::picture_options::PictureOptions;
 use super::shared::exit::Exit;
 use super::shared::files;
 use super::shared::output::{counted, print_line, usage_error};
-use super::tool_commands::progress_bar;
+use super::shared::progress::progress_bar;
 
 /// Export the maps of a recording: files for each map, or one MCAP file for viewers.
 ///

@@ -209,28 +209,9 @@ mod tests {
 
     use super::*;
 
-    const OPTIONS_MAX: usize = 150;
-
     #[test]
     fn the_command_line_is_sound() {
         command().debug_assert();
-    }
-
-    /// Number of long options of a command and of its subcommands, without `--help` and `--version`. An option that a
-    /// command shares with its subcommands counts once.
-    fn long_options(command: &clap::Command) -> usize {
-        let is_counted = |argument: &&clap::Arg| !matches!(argument.get_long(), None | Some("help" | "version"));
-        let own = command.get_arguments().filter(is_counted).count();
-        own + command.get_subcommands().map(long_options).sum::<usize>()
-    }
-
-    /// The number may only fall: an option is one more thing to know, to test and to keep.
-    #[test]
-    fn the_command_has_at_most_150_long_options() {
-        let command = command();
-        let of = |command: &clap::Command| format!("{} {}", command.get_name(), long_options(command));
-        let listed: Vec<String> = command.get_subcommands().map(of).collect();
-        assert!(long_options(&command) <= OPTIONS_MAX, "{}: {}", long_options(&command), listed.join(", "));
     }
 
     #[test]

@@ -15,7 +15,7 @@ use tokio::runtime::Builder;
 use super::shared::exit::Exit;
 use super::shared::files;
 use super::shared::output::{counted, print_line, stop_signal};
-use super::tool_commands::progress_bar;
+use super::shared::progress::progress_bar;
 
 /// Send the datagrams of a capture over UDP, at the recorded pace.
 ///

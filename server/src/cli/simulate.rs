@@ -14,7 +14,7 @@ use super::send::stop_flag;
 use super::send::target;
 use super::shared::model::ModelParser;
 use super::shared::output::{counted, print_line};
-use super::tool_commands::progress_bar;
+use super::shared::progress::progress_bar;
 
 /// The names of the scenes as the command line accepts them.
 fn names() -> PossibleValuesParser {

@@ -2,7 +2,6 @@
 
 use anyhow::Result;
 use clap::Subcommand;
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::shared::exit::Exit;
 use super::{demo, evaluate, export, get, init, send, simulate};
@@ -34,10 +33,4 @@ pub fn run(command: ToolCommand) -> Result<Exit> {
         ToolCommand::Simulate(arguments) => simulate::run(&arguments)?,
     }
     Ok(Exit::Good)
-}
-
-/// A progress bar on stderr of `length` bytes; nothing is drawn if stderr is not a terminal.
-pub fn progress_bar(length: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg}").expect("the template is a constant");
-    ProgressBar::new(length).with_style(style)
 }

@@ -18,7 +18,7 @@ use clearway_daemon::publish::{Served, Vehicles};
 use clearway_daemon::record::writer::RecordingWriter;
 use clearway_daemon::status::{Transport, VehicleStatus};
 use clearway_journal::encode::EncodedMap;
-use clearway_journal::mcap_file::Header;
+use clearway_journal::mcap_file::RecordingHeader;
 use clearway_mapping::pipeline::{Pipeline, layer_names};
 use clearway_proto::v1;
 use clearway_sim::impair::Impairment;
@@ -97,7 +97,7 @@ impl<'a> TestBed<'a> {
             vehicle.queue,
         );
         let vehicles = vec![("car".into(), layers.clone())];
-        let header = Header { boot_id: 1, config: config.to_toml(), vehicles, ..Header::default() };
+        let header = RecordingHeader { boot_id: 1, config: config.to_toml(), vehicles, ..RecordingHeader::default() };
         let disk = MemoryDisk::new(plan.disk.clone());
         let began = Instant::now();
         let tables = vec![None; vehicle.sensors.len()];

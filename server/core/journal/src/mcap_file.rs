@@ -40,7 +40,7 @@ use crate::encode::{self, EncodedMap};
 
 /// The contents of a recording before its first event.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Header {
+pub struct RecordingHeader {
     /// Identifies the run of the server.
     pub boot_id: u64,
     /// The effective configuration, TOML.
@@ -164,7 +164,7 @@ impl<D: Disk> McapFile<D> {
     pub fn create(
         disk: D,
         recorded: RecordedMaps,
-        header: &Header,
+        header: &RecordingHeader,
         part: u64,
         begins_ns: i64,
     ) -> Result<Self, McapError> {

@@ -4,8 +4,8 @@ use std::fs::{self, File};
 use std::io::{Error, Write as _};
 use std::path::Path;
 
-use super::file_advice::{advised, open_to_read};
 use anyhow::{Context, Result, anyhow, bail};
+use clearway_journal::file_advice::{advised, open_to_read};
 
 /// Opens a file to read; returns it and its length in bytes.
 ///

@@ -3,7 +3,7 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`udp`] | UDP sockets -> batches of datagrams, by vehicle and sensor |
-//! | [`grpc`] | observations over gRPC -> gateway; reports back |
+//! | [`publish::grpc::ingest`](crate::publish::grpc::ingest) | observations over gRPC -> gateway; reports back |
 //! | `zenoh` | observations over zenoh -> a queue for each source |
 //! | `zenoh_source` | the queue of one source -> gateway; reports back |
 //! | [`gateway`] | one observation of a client -> events on the queue of its vehicle |
@@ -18,7 +18,6 @@
 pub mod admission;
 pub mod drops;
 pub mod gateway;
-pub mod grpc;
 pub mod observation;
 pub mod queue;
 pub mod receipt;

@@ -38,7 +38,7 @@ const RECENT: Duration = Duration::from_secs(1);
 const END_PERIOD: Duration = Duration::from_secs(1);
 
 /// The subscription to the observations of one vehicle, and the publisher of its reports.
-pub struct Ingest {
+pub struct ZenohIngest {
     common: Common,
     queues: Arc<Mutex<Queues>>,
     opened: UnboundedReceiver<Source>,
@@ -46,7 +46,7 @@ pub struct Ingest {
     _subscriber: Subscriber<()>,
 }
 
-impl Ingest {
+impl ZenohIngest {
     /// Subscribes to the keys of a vehicle. Without `senders` every peer may send.
     ///
     /// # Errors

@@ -291,13 +291,13 @@ async fn connect(
     upgrade.on_upgrade(move |socket| async move {
         let mut published = all.published.subscribe();
         published.mark_changed();
-        let client = Client { all, caller, subscriptions: BTreeMap::new() };
+        let client = FoxgloveClient { all, caller, subscriptions: BTreeMap::new() };
         call.slot.closing.run_until_cancelled(client.run(socket, published, &call.slot)).await;
     })
 }
 
 /// One connected client.
-struct Client {
+struct FoxgloveClient {
     all: All,
     caller: Caller,
     subscriptions: BTreeMap<u32, Subscription>,
@@ -314,7 +314,7 @@ struct Subscription {
 /// What a client may ask for.
 #[derive(Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase")]
-enum Request {
+enum FoxgloveRequest {
     Subscribe {
         subscriptions: Vec<Wanted>,
     },
@@ -332,7 +332,7 @@ struct Wanted {
     channel_id: u64,
 }
 
-impl Client {
+impl FoxgloveClient {
     /// Sends what the client subscribes to until it disconnects or stalls.
     async fn run(mut self, mut socket: WebSocket, mut published: watch::Receiver<u64>, slot: &ConnectionSlot) {
         let channels = self.channels().map(|(_, channel)| channel.advertisement());
@@ -390,12 +390,12 @@ impl Client {
     /// # Errors
     /// A text that says what of a request cannot be done.
     fn apply(&mut self, text: &str) -> Result<(), String> {
-        let request: Request = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        let request: FoxgloveRequest = serde_json::from_str(text).map_err(|error| error.to_string())?;
         match request {
-            Request::Unsubscribe { subscription_ids } => {
+            FoxgloveRequest::Unsubscribe { subscription_ids } => {
                 subscription_ids.iter().for_each(|id| _ = self.subscriptions.remove(id));
             }
-            Request::Subscribe { subscriptions } => {
+            FoxgloveRequest::Subscribe { subscriptions } => {
                 for Wanted { id, channel_id } in subscriptions {
                     if self.subscriptions.len() >= SUBSCRIPTIONS_MAX {
                         return Err(format!("subscription {id}: at most {SUBSCRIPTIONS_MAX} are allowed"));

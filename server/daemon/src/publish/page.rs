@@ -38,16 +38,6 @@ struct Assets;
 #[prefix = "wire/"]
 struct Decoder;
 
-/// The documents with a table of the classes, by layer.
-const LAYERS: [(&str, &str); 7] = [
-    ("drivability", include_str!("../../../core/mapping/src/layer/drivability/README.md")),
-    ("height_difference", include_str!("../../../core/mapping/src/layer/height_difference/README.md")),
-    ("terrain", include_str!("../../../core/mapping/src/layer/terrain/README.md")),
-    ("occupancy", include_str!("../../../core/mapping/src/layer/occupancy/README.md")),
-    ("speed", include_str!("../../../core/mapping/src/layer/speed/README.md")),
-    ("safe_path", include_str!("../../../core/mapping/src/layer/safe_path/README.md")),
-    ("freespace", include_str!("../../../core/mapping/src/layer/freespace/README.md")),
-];
 /// The document with a table of the meanings.
 const MEANINGS: &str = include_str!("../../../../client/guide/planner.md");
 
@@ -58,7 +48,7 @@ static CLASSES: LazyLock<String> = LazyLock::new(|| {
         rows(document, "| class |").filter_map(says).collect()
     };
     let of_layer = |(name, document): &(&str, &str)| ((*name).to_owned(), classes(document).into());
-    let layers: Map<String, Value> = LAYERS.iter().map(of_layer).collect();
+    let layers: Map<String, Value> = clearway_mapping::layer::PAGES.iter().map(of_layer).collect();
     let may = |row: Vec<&str>| Some(((*row.first()?).to_owned(), (*row.get(1)?).into()));
     let meanings: Map<String, Value> = rows(MEANINGS, "| meaning |").filter_map(may).collect();
     json!({ "layers": layers, "meanings": meanings }).to_string()

@@ -12,7 +12,7 @@ use crate::fleet::Fleet;
 use crate::ingest::gateway::Gateways;
 use crate::ingest::queue::EventQueue;
 use crate::ingest::ros::live::{self, LiveTopics};
-use crate::ingest::zenoh::Ingest;
+use crate::ingest::zenoh::ZenohIngest;
 use crate::publish::listen::access::Access;
 use crate::publish::zenoh::Publisher;
 use crate::publish::{Vehicles, announcements, zenoh_recorder};
@@ -70,7 +70,7 @@ impl OverZenoh {
         };
         let (mut ingest, mut ros, mut recorder) = (JoinSet::new(), Vec::new(), JoinSet::new());
         for gateway in gateways.all() {
-            let subscribed = Ingest::subscribe(&session, gateway.clone(), senders(&session, config)).await?;
+            let subscribed = ZenohIngest::subscribe(&session, gateway.clone(), senders(&session, config)).await?;
             ingest.spawn(subscribed.run());
         }
         for served in vehicles.0.iter() {

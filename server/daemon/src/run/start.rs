@@ -33,7 +33,6 @@ use crate::engine::compute_permits::ComputePermits;
 use crate::engine::wires::Wires;
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
-use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
 use crate::ingest::udp;
 use crate::publish::listen::security::{Current, Security};
@@ -47,7 +46,7 @@ use crate::status::{VehicleStatus, watch_states};
 use crate::traces::Traces;
 #[cfg(feature = "zenoh")]
 use crate::zenoh_session;
-use clearway_journal::mcap_file::Header;
+use clearway_journal::mcap_file::RecordingHeader;
 
 /// Longest time between two signs of life of a listener that does not hang: it gives one twice a second.
 const LISTENER_SILENT_MAX: Duration = Duration::from_secs(3);
@@ -157,7 +156,7 @@ impl Running {
         (certificates, mut held): (Option<Certificates>, HeldSockets),
         prepared: Vec<Prepared>,
         driver: Driver,
-        header: impl FnOnce() -> Header,
+        header: impl FnOnce() -> RecordingHeader,
     ) -> Result<(), StartError> {
         // Before the recorder: a port in use must not overwrite an earlier recording.
         let current = Current::new(config, certificates.as_ref()).map_err(StartError::Certificates)?;
@@ -219,7 +218,7 @@ impl Running {
         config: &Config,
         prepared: Vec<Prepared>,
         driver: Driver,
-        header: impl FnOnce() -> Header,
+        header: impl FnOnce() -> RecordingHeader,
     ) -> Result<(), StartError> {
         let mut handles = Vec::new().into_iter();
         if recording_path(&config.recorder).is_some() {
@@ -304,7 +303,7 @@ impl Running {
         if let Some(listener) = grpc {
             let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
             let fleet = self.fleet.clone();
-            let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
+            let ingest = (!gateways.all().is_empty()).then(|| grpc::ingest::GrpcIngest::new(gateways).into_service());
             self.publishers.spawn(async move {
                 let served = grpc::serve(listener, vehicles, fleet, ingest, recorder, replay, stopped);
                 if let Err(error) = served.await {
@@ -408,7 +407,7 @@ fn header(
     boot_id: u64,
     config_comments: &[String],
     mut metadata: BTreeMap<String, String>,
-) -> Header {
+) -> RecordingHeader {
     let mut tables = Vec::new();
     for (vehicle, of_vehicle) in config.vehicles.iter().zip(calibrations) {
         for (sensor, table) in vehicle.sensors.iter().zip(of_vehicle) {
@@ -425,7 +424,7 @@ fn header(
     }
     let vehicles = config.vehicles.iter().map(|v| (v.name.as_str().into(), layer_names(&v.maps))).collect();
     let config = comment_lines(config_comments) + &config.to_toml();
-    Header { boot_id, config, vehicles, calibrations: tables, metadata }
+    RecordingHeader { boot_id, config, vehicles, calibrations: tables, metadata }
 }
 
 /// A random 64-bit number: the system seeds each `RandomState` with its randomness.

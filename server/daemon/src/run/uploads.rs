@@ -211,13 +211,13 @@ mod tests {
     use super::*;
     use crate::config::Recorder as Options;
     use crate::record::writer::Recorder;
-    use clearway_journal::mcap_file::Header;
+    use clearway_journal::mcap_file::RecordingHeader;
 
     #[tokio::test]
     async fn a_store_that_hangs_is_named_before_a_part_is_sent() {
         let folder = tempfile::tempdir().unwrap();
         let options = Options { file: folder.path().join("car.mcap"), ..Options::default() };
-        let (recorder, _handles) = Recorder::start(&options, &Header::default(), false).unwrap();
+        let (recorder, _handles) = Recorder::start(&options, &RecordingHeader::default(), false).unwrap();
         let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/drive.mcap");
         std::fs::copy(golden, folder.path().join("car-1.part-0001.mcap")).unwrap();
         let store = Store { url: "s3://drives".into(), ..Store::default() };
@@ -239,7 +239,7 @@ mod tests {
         let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/drive.mcap");
         let add = |part: u64| _ = std::fs::copy(golden, at(&format!("car-1.part-{part:04}.mcap"))).unwrap();
         let options = Options { file: at("car.mcap"), ..Options::default() };
-        let (recorder, handles) = Recorder::start(&options, &Header::default(), false).unwrap();
+        let (recorder, handles) = Recorder::start(&options, &RecordingHeader::default(), false).unwrap();
         let counts = recorder.counts();
         let store = Store { url: at("store").display().to_string(), ..Store::default() };
         let mut uploads = Uploads::new(store, Duration::ZERO, recorder.control(), counts.clone());

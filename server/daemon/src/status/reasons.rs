@@ -1,7 +1,7 @@
 //! The reasons that metrics show with 0 before they occur, so that the first occurrence is a rise.
 
 /// Reasons for which packets and scans are refused; each has a series before it occurs, so that a rate is known then.
-pub const PACKET_REASONS: [&str; 19] = [
+pub const PACKET_REASONS: [&str; 20] = [
     "azimuth",
     "block_flag",
     "calibration",
@@ -13,6 +13,7 @@ pub const PACKET_REASONS: [&str; 19] = [
     "nmea",
     "no_returns",
     "observation",
+    "scan_far",
     "scan_lengths",
     "scan_model",
     "scan_offset",
@@ -23,23 +24,29 @@ pub const PACKET_REASONS: [&str; 19] = [
     "telemetry",
 ];
 /// Reasons for which messages are no observations.
-pub const OBSERVATION_REASONS: [&str; 13] = [
+pub const OBSERVATION_REASONS: [&str; 19] = [
     "body",
     "columns",
+    "key",
     "message",
     "message_length",
     "missing",
+    "number",
     "packed",
     "packets",
+    "plan",
     "points",
+    "role",
     "ros_frame",
     "ros_kind",
     "ros_message",
     "ros_part",
+    "ros_type",
+    "sensor",
     "stamp_ahead",
 ];
 /// Reasons for which a listener refuses or closes connections and calls.
-pub const CLOSE_REASONS: [&str; 15] = [
+pub const CLOSE_REASONS: [&str; 16] = [
     "accept_error",
     "calls",
     "certificate_end",
@@ -55,4 +62,5 @@ pub const CLOSE_REASONS: [&str; 15] = [
     "role_lost",
     "stalled",
     "streams",
+    "unknown_vehicle",
 ];

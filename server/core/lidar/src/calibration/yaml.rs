@@ -11,10 +11,10 @@ use super::error::CalibrationError;
 use super::table::{Calibration, LaserCalibration};
 
 pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
-    let root: Node = serde_yaml_ng::from_str(text).map_err(|e| CalibrationError::Yaml(e.to_string()))?;
-    let root = Map::new(String::new(), &root)?;
+    let root: YamlNode = serde_yaml_ng::from_str(text).map_err(|e| CalibrationError::Yaml(e.to_string()))?;
+    let root = YamlMap::new(String::new(), &root)?;
     let list = match root.get("lasers")? {
-        Some(Node::List(list)) => list,
+        Some(YamlNode::List(list)) => list,
         Some(other) => return Err(root.wrong("lasers", other, LASERS)),
         None => return Err(CalibrationError::Missing { key: "lasers".into(), allowed: LASERS }),
     };
@@ -33,8 +33,8 @@ pub(super) fn write(calibration: &Calibration) -> String {
 
 const LASERS: &str = "a list with one map a laser";
 
-fn laser(index: usize, node: &Node) -> Result<LaserCalibration, CalibrationError> {
-    let map = Map::new(format!("lasers[{index}]"), node)?;
+fn laser(index: usize, node: &YamlNode) -> Result<LaserCalibration, CalibrationError> {
+    let map = YamlMap::new(format!("lasers[{index}]"), node)?;
     let required = |key, bounds| {
         map.number(key, bounds)?.ok_or(CalibrationError::Missing { key: map.path(key), allowed: bounds.1 })
     };
@@ -59,15 +59,15 @@ fn laser(index: usize, node: &Node) -> Result<LaserCalibration, CalibrationError
 const BYTE: ((f64, f64), &str) = ((0.0, 255.0), "a whole number, 0 to 255");
 
 /// A map and its path in the document.
-struct Map<'a> {
+struct YamlMap<'a> {
     path: String,
-    entries: &'a [(String, Node)],
+    entries: &'a [(String, YamlNode)],
 }
 
-impl<'a> Map<'a> {
-    fn new(path: String, node: &'a Node) -> Result<Self, CalibrationError> {
+impl<'a> YamlMap<'a> {
+    fn new(path: String, node: &'a YamlNode) -> Result<Self, CalibrationError> {
         match node {
-            Node::Map(entries) => Ok(Self { path, entries }),
+            YamlNode::Map(entries) => Ok(Self { path, entries }),
             other if path.is_empty() => {
                 Err(CalibrationError::Format(format!("{} instead of a map of keys", other.shown())))
             }
@@ -79,7 +79,7 @@ impl<'a> Map<'a> {
         if self.path.is_empty() { key.into() } else { format!("{}.{key}", self.path) }
     }
 
-    fn get(&self, key: &str) -> Result<Option<&'a Node>, CalibrationError> {
+    fn get(&self, key: &str) -> Result<Option<&'a YamlNode>, CalibrationError> {
         let mut found = self.entries.iter().filter(|(k, _)| k == key).map(|(_, node)| node);
         let first = found.next();
         match (first, found.find(|node| Some(*node) != first)) {
@@ -90,7 +90,7 @@ impl<'a> Map<'a> {
         }
     }
 
-    fn wrong(&self, key: &str, node: &Node, allowed: &'static str) -> CalibrationError {
+    fn wrong(&self, key: &str, node: &YamlNode, allowed: &'static str) -> CalibrationError {
         CalibrationError::Value { key: self.path(key), value: node.shown(), allowed }
     }
 
@@ -110,7 +110,7 @@ impl<'a> Map<'a> {
     fn flag(&self, key: &str) -> Result<bool, CalibrationError> {
         match self.get(key)? {
             None => Ok(false),
-            Some(Node::Flag(flag)) => Ok(*flag),
+            Some(YamlNode::Flag(flag)) => Ok(*flag),
             Some(other) => Err(self.wrong(key, other, "true or false")),
         }
     }
@@ -118,36 +118,36 @@ impl<'a> Map<'a> {
 
 /// A node of a YAML document. A map keeps keys that occur twice.
 #[derive(Debug, PartialEq)]
-enum Node {
+enum YamlNode {
     Nothing,
     Flag(bool),
     Number(f64),
     Text(String),
-    List(Vec<Node>),
-    Map(Vec<(String, Node)>),
+    List(Vec<YamlNode>),
+    Map(Vec<(String, YamlNode)>),
 }
 
-impl Node {
+impl YamlNode {
     fn number(&self) -> Option<f64> {
         match self {
-            Node::Number(number) => Some(*number),
+            YamlNode::Number(number) => Some(*number),
             _ => None,
         }
     }
 
     fn shown(&self) -> String {
         match self {
-            Node::Nothing => "nothing".into(),
-            Node::Flag(flag) => flag.to_string(),
-            Node::Number(number) => number.to_string(),
-            Node::Text(text) => format!("`{}`", text.chars().take(40).collect::<String>()),
-            Node::List(list) => format!("a list of {}", list.len()),
-            Node::Map(map) => format!("a map of {}", map.len()),
+            YamlNode::Nothing => "nothing".into(),
+            YamlNode::Flag(flag) => flag.to_string(),
+            YamlNode::Number(number) => number.to_string(),
+            YamlNode::Text(text) => format!("`{}`", text.chars().take(40).collect::<String>()),
+            YamlNode::List(list) => format!("a list of {}", list.len()),
+            YamlNode::Map(map) => format!("a map of {}", map.len()),
         }
     }
 }
 
-impl<'de> Deserialize<'de> for Node {
+impl<'de> Deserialize<'de> for YamlNode {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         deserializer.deserialize_any(NodeVisitor)
     }
@@ -156,45 +156,45 @@ impl<'de> Deserialize<'de> for Node {
 struct NodeVisitor;
 
 impl<'de> Visitor<'de> for NodeVisitor {
-    type Value = Node;
+    type Value = YamlNode;
 
     fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str("a number, a flag, a text, a list or a map")
     }
-    fn visit_unit<E>(self) -> Result<Node, E> {
-        Ok(Node::Nothing)
+    fn visit_unit<E>(self) -> Result<YamlNode, E> {
+        Ok(YamlNode::Nothing)
     }
-    fn visit_bool<E>(self, value: bool) -> Result<Node, E> {
-        Ok(Node::Flag(value))
+    fn visit_bool<E>(self, value: bool) -> Result<YamlNode, E> {
+        Ok(YamlNode::Flag(value))
     }
-    fn visit_i64<E>(self, value: i64) -> Result<Node, E> {
-        Ok(Node::Number(value as f64))
+    fn visit_i64<E>(self, value: i64) -> Result<YamlNode, E> {
+        Ok(YamlNode::Number(value as f64))
     }
-    fn visit_u64<E>(self, value: u64) -> Result<Node, E> {
-        Ok(Node::Number(value as f64))
+    fn visit_u64<E>(self, value: u64) -> Result<YamlNode, E> {
+        Ok(YamlNode::Number(value as f64))
     }
-    fn visit_f64<E>(self, value: f64) -> Result<Node, E> {
-        Ok(Node::Number(value))
+    fn visit_f64<E>(self, value: f64) -> Result<YamlNode, E> {
+        Ok(YamlNode::Number(value))
     }
-    fn visit_str<E>(self, value: &str) -> Result<Node, E> {
-        Ok(Node::Text(value.into()))
+    fn visit_str<E>(self, value: &str) -> Result<YamlNode, E> {
+        Ok(YamlNode::Text(value.into()))
     }
-    fn visit_seq<A: SeqAccess<'de>>(self, mut access: A) -> Result<Node, A::Error> {
+    fn visit_seq<A: SeqAccess<'de>>(self, mut access: A) -> Result<YamlNode, A::Error> {
         let mut list = Vec::new();
         while let Some(node) = access.next_element()? {
             list.push(node);
         }
-        Ok(Node::List(list))
+        Ok(YamlNode::List(list))
     }
-    fn visit_map<A: MapAccess<'de>>(self, mut access: A) -> Result<Node, A::Error> {
+    fn visit_map<A: MapAccess<'de>>(self, mut access: A) -> Result<YamlNode, A::Error> {
         let mut map = Vec::new();
-        while let Some(key) = access.next_key::<Node>()? {
+        while let Some(key) = access.next_key::<YamlNode>()? {
             let key = match key {
-                Node::Text(text) => text,
+                YamlNode::Text(text) => text,
                 other => other.shown(),
             };
             map.push((key, access.next_value()?));
         }
-        Ok(Node::Map(map))
+        Ok(YamlNode::Map(map))
     }
 }

@@ -27,9 +27,9 @@ const AGREED_SPREAD_NS: i64 = 100_000_000;
 pub(super) struct MinimumDelay {
     /// The packets since the last revolution ended.
     revolution: Option<Packets>,
-    window: Option<Window>,
+    window: Option<DelayWindow>,
     /// The newest revolutions that agree.
-    agreed: Option<Window>,
+    agreed: Option<DelayWindow>,
     /// True if the packets of the newest revolution arrived in a burst.
     is_burst: bool,
 }
@@ -46,14 +46,14 @@ struct Packets {
 
 /// The least delays of the revolutions of a window.
 #[derive(Clone, Copy, Debug)]
-struct Window {
+struct DelayWindow {
     /// Start of the window on the timeline.
     start_ns: i64,
     least_ns: i64,
     greatest_ns: i64,
 }
 
-impl Window {
+impl DelayWindow {
     /// The window with one more revolution.
     fn with(self, delay_ns: i64) -> Self {
         Self { least_ns: self.least_ns.min(delay_ns), greatest_ns: self.greatest_ns.max(delay_ns), ..self }
@@ -73,7 +73,7 @@ impl MinimumDelay {
     /// packets.
     pub fn end_revolution(&mut self, first_ns: i64) -> Option<i64> {
         let Packets { least_ns: delay_ns, first, newest } = self.revolution.take()?;
-        let only = Window { start_ns: first_ns, least_ns: delay_ns, greatest_ns: delay_ns };
+        let only = DelayWindow { start_ns: first_ns, least_ns: delay_ns, greatest_ns: delay_ns };
         self.window = Some(self.window.unwrap_or(only).with(delay_ns));
         let agreed = self.agreed.unwrap_or(only).with(delay_ns);
         let agrees = agreed.greatest_ns - agreed.least_ns <= AGREED_SPREAD_NS && agreed.start_ns <= first_ns;

@@ -43,5 +43,6 @@ pub use channel::{CellType, Cells, Channel, TypedChannel};
 pub use class::{ClassInfo, Meaning};
 pub use grid::Geometry;
 pub use maker::{Context, Layer, LayerMaker, SafePoint};
+pub use registry::PAGES;
 
 pub use crate::sensor::rays::Rays;

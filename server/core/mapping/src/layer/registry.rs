@@ -101,6 +101,10 @@ macro_rules! layers {
             }
         }
 
+        /// The page of each layer, Markdown with a table of its classes, by the layer's name.
+        pub const PAGES: &[(&str, &str)] =
+            &[$((stringify!($name), include_str!(concat!(stringify!($name), "/README.md")))),+];
+
         const LAYERS: &[Create] = &[$(|maps| {
             let config = &maps.$name;
             if config.enabled { Some(Box::new(<$Maker>::new(config))) } else { None }

@@ -1,8 +1,9 @@
 //! The gRPC server: `clearway.v1.MapService`, `PlanService` and `RecordingService`, standard health and reflection, and
-//! the ingest service if it is configured ([`crate::ingest::grpc`]).
+//! the ingest service if it is configured ([`ingest`]).
 //!
 //! [`listen`](super::listen) accepts the connections and checks who calls. [`reader`] has the updates of one reader.
 
+pub mod ingest;
 mod plan;
 pub mod reader;
 mod recording;

@@ -7,7 +7,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use tonic::Status;
+use axum::http::Response;
+use tonic::{Code, Status};
 
 use crate::config::{self, Only};
 
@@ -232,6 +233,16 @@ impl Access {
 fn roles_for(path: &str) -> &'static [Role] {
     let listed = PATHS.iter().find(|(listed, _)| *listed == path);
     listed.or_else(|| PATHS.last()).map_or(&[], |(_, roles)| roles)
+}
+
+/// The word under which a call is counted that a gRPC service has answered with a refusal instead of a stream.
+pub(super) fn refusal<B>(response: &Response<B>) -> Option<&'static str> {
+    match Code::from_bytes(response.headers().get("grpc-status")?.as_bytes()) {
+        Code::PermissionDenied => Some("denied"),
+        Code::NotFound => Some("unknown_vehicle"),
+        Code::DeadlineExceeded => Some("no_request"),
+        _ => None,
+    }
 }
 
 #[cfg(test)]

@@ -281,6 +281,7 @@ impl Shared {
                 request.extensions_mut().insert(call.clone());
                 let Ok(()) = poll_fn(|context| Service::<Request<Body>>::poll_ready(&mut router, context)).await;
                 let Ok(response) = router.call(request).await;
+                access::refusal(&response).inspect(|reason| slot.count(reason));
                 // The call is in progress until its response ends.
                 response.map(|body| {
                     Body::new(body.map_frame(move |frame| {

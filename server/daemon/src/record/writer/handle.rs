@@ -20,7 +20,7 @@ use crate::config::Recorder as Options;
 use crate::traces::Hop;
 use clearway_journal::RecordedMaps;
 use clearway_journal::encode::EncodedMap;
-use clearway_journal::mcap_file::Header;
+use clearway_journal::mcap_file::RecordingHeader;
 
 /// Greatest difference of the stamps of the newest maps of both pipelines at a handover, ns. Ours: far below the period
 /// of a sensor, so that the stamps of the maps rise across the handover.
@@ -58,12 +58,12 @@ pub(super) struct Link {
     pub counts: Arc<RecorderCounts>,
     pub wanted: WantedPart,
     pub options: Options,
-    pub header: Header,
+    pub header: RecordingHeader,
     pub waits: bool,
 }
 
 /// The queue of a recording, with a handle for each vehicle of the header. What the handles send belongs to part 1.
-pub(super) fn link(options: &Options, header: &Header, waits: bool) -> (Link, Vec<RecordingHandle>) {
+pub(super) fn link(options: &Options, header: &RecordingHeader, waits: bool) -> (Link, Vec<RecordingHandle>) {
     let (queue, items) = flume::bounded(options.queue);
     let mut header = header.clone();
     if options.maps == RecordedMaps::None {

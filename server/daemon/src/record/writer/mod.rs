@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 
 use crate::base::file_advice::advised;
 use crate::config::Recorder as Options;
-use clearway_journal::mcap_file::Header;
+use clearway_journal::mcap_file::RecordingHeader;
 
 mod control;
 mod counts;
@@ -65,7 +65,11 @@ impl Recorder {
     /// # Errors
     /// [`RecordError::Create`] if the file exists or it or the thread cannot be created, [`RecordError::Write`] if the
     /// header cannot be written.
-    pub fn start(options: &Options, header: &Header, waits: bool) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
+    pub fn start(
+        options: &Options,
+        header: &RecordingHeader,
+        waits: bool,
+    ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
         let of_folder = options.clone();
         Self::start_in(move || Folder::open(&of_folder), options, header, waits)
     }
@@ -74,7 +78,7 @@ impl Recorder {
     fn start_in<F: Files + 'static>(
         open: impl FnOnce() -> io::Result<F> + Send + 'static,
         options: &Options,
-        header: &Header,
+        header: &RecordingHeader,
         waits: bool,
     ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
         let path = options.file.clone();
@@ -148,7 +152,7 @@ mod tests {
     #[test]
     fn a_file_that_cannot_be_created_is_named() {
         let options = Options { file: "/proc/no/such.mcap".into(), ..Options::default() };
-        let error = Recorder::start(&options, &Header::default(), false).map(|_| ()).unwrap_err().to_string();
+        let error = Recorder::start(&options, &RecordingHeader::default(), false).map(|_| ()).unwrap_err().to_string();
         assert!(error.contains("/proc/no"), "{error}");
     }
 
@@ -156,7 +160,7 @@ mod tests {
     fn a_disk_that_hangs_at_the_start_delays_nothing_and_gets_everything_when_it_answers() {
         let temporary = tempfile::tempdir().unwrap();
         let options = Options { file: temporary.path().join("car.mcap"), ..Options::default() };
-        let header = Header { vehicles: vec![("car".into(), vec!["speed"])], ..Header::default() };
+        let header = RecordingHeader { vehicles: vec![("car".into(), vec!["speed"])], ..RecordingHeader::default() };
         let (answers, is_answered) = channel();
         let of_folder = options.clone();
         let hanging = move || {
@@ -189,7 +193,7 @@ mod tests {
             is_answered.recv().unwrap();
             Err(io::Error::other("pulled out"))
         };
-        let (recorder, handles) = Recorder::start_in(hanging, &options, &Header::default(), false).unwrap();
+        let (recorder, handles) = Recorder::start_in(hanging, &options, &RecordingHeader::default(), false).unwrap();
         answers.send(()).unwrap();
         drop(handles);
         let error = recorder.finish().unwrap_err().to_string();
@@ -202,7 +206,7 @@ mod tests {
         let file = temporary.path().join("car.mcap");
         std::fs::write(&file, "precious").unwrap();
         let options = Options { file: file.clone(), ..Options::default() };
-        let error = Recorder::start(&options, &Header::default(), false).map(|_| ()).unwrap_err().to_string();
+        let error = Recorder::start(&options, &RecordingHeader::default(), false).map(|_| ()).unwrap_err().to_string();
         assert!(error.contains("the file exists and is not overwritten"), "{error}");
         assert_eq!(std::fs::read(&file).unwrap(), b"precious");
     }

@@ -22,7 +22,7 @@ use super::part::Part;
 use crate::base::clock::now_ns;
 use crate::config::Recorder as Options;
 use clearway_journal::encode::EncodedMap;
-use clearway_journal::mcap_file::{Header, McapFile};
+use clearway_journal::mcap_file::{McapFile, RecordingHeader};
 
 /// Time between two attempts to begin a part on a disk that has failed. Ours: a disk that is full or was pulled out
 /// needs a person.
@@ -45,7 +45,7 @@ struct VehicleState {
 pub struct RecordingWriter<F: Files> {
     files: F,
     options: Options,
-    header: Header,
+    header: RecordingHeader,
     /// The open parts, the older one first.
     parts: VecDeque<Part<F::File>>,
     vehicles: Vec<VehicleState>,
@@ -77,7 +77,7 @@ impl<F: Files> RecordingWriter<F> {
     pub fn new(
         files: F,
         options: &Options,
-        header: &Header,
+        header: &RecordingHeader,
         waits: bool,
         now: Instant,
     ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {

@@ -2,7 +2,7 @@
 //!
 //! A stream reads its next observation only while its events in flight are within the vehicle's limits and the peer
 //! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine
-//! returns the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as
+//! returns the outcome of each event by its [`Receipt`](crate::ingest::receipt::Receipt); the stream collects outcomes into as
 //! few reports as the transport can send. It runs in a task of its own, so that a peer that takes no reports keeps
 //! neither a permit nor an event.
 
@@ -18,9 +18,9 @@ use futures::{FutureExt, Stream, stream};
 use tokio::sync::mpsc::{self, UnboundedReceiver, channel, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
-use super::admission::{AdmissionPermit, OpenStream};
-use super::gateway::{Gateway, Gateways};
-use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
+use crate::ingest::admission::{AdmissionPermit, OpenStream};
+use crate::ingest::gateway::{Gateway, Gateways};
+use crate::ingest::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 use crate::publish::listen::CallPermit;
 use crate::publish::listen::access::Caller;
 
@@ -30,11 +30,11 @@ use v1::ingest_service_server::{IngestService, IngestServiceServer};
 const OPENING_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// The implementation of `clearway.v1.IngestService`.
-pub struct Ingest {
+pub struct GrpcIngest {
     gateways: Gateways,
 }
 
-impl Ingest {
+impl GrpcIngest {
     /// The service for the vehicles of these gateways.
     pub fn new(gateways: Gateways) -> Self {
         Self { gateways }
@@ -48,7 +48,7 @@ impl Ingest {
 }
 
 #[tonic::async_trait]
-impl IngestService for Ingest {
+impl IngestService for GrpcIngest {
     type StreamStream = Pin<Box<dyn Stream<Item = Result<v1::IngestReport, Status>> + Send>>;
 
     async fn stream(
