@@ -1,8 +1,8 @@
 //! Two sets of maps of one drive -> what changed: cells by layer and class, gained and lost free space, the maps that
 //! changed most.
 //!
-//! The maps before are those of a recording. The maps after are computed from its events with another configuration,
-//! or are those of another recording. Maps with the same stamp are compared; maps that only one side has are counted.
+//! The maps before come from a recording. The maps after are computed from its events with another configuration, or
+//! come from another recording. Maps with the same stamp are compared; maps that only one side has are counted.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -25,14 +25,14 @@ mod computing;
 
 /// Where the maps after the change come from.
 pub enum After<'a> {
-    /// They are computed from the recorded events with another configuration.
+    /// Maps computed from the recorded events with another configuration.
     Config {
         /// The configuration of each recorded vehicle, in any order; without tables, a vehicle uses the recorded ones.
         given: &'a [RecordedVehicle],
         /// The recorded configuration.
         recorded: &'a [RecordedVehicle],
     },
-    /// They are those of this recording.
+    /// The maps of this recording.
     Recording(&'a Path),
 }
 
@@ -45,13 +45,13 @@ pub struct Comparison {
     pub after: u64,
     /// How a file is incomplete, with its name; `None` if both are whole.
     pub incomplete: Option<String>,
-    /// True if events are missing: the maps after them are not compared with those of a configuration, because they may
-    /// differ for that reason alone.
+    /// True if events are missing. The maps after them are not compared with maps of a configuration: the missing
+    /// events alone may make them differ.
     pub is_ended_by_loss: bool,
     /// What changed, by vehicle and layer.
     pub layers: BTreeMap<(String, String), LayerChange>,
-    /// The maps with the greatest share of changed cells: that of each layer, greatest first, then the second of each
-    /// layer, and so on.
+    /// The maps with the greatest share of changed cells: the first map of each layer, greatest share first, then the
+    /// second map of each layer, and so on.
     pub worst: Vec<MapChange>,
 }
 
@@ -137,7 +137,7 @@ pub enum CompareError {
         /// The fault.
         source: Box<MapError>,
     },
-    /// A recording has no maps to compare with those of another one.
+    /// A recording has no maps to compare with another recording's maps.
     #[error(
         "{} has no maps (recorder.maps = {:?}): `clearway replay` makes them with --record", file.display(), maps.as_str()
     )]
@@ -192,7 +192,7 @@ impl MapChange {
     }
 }
 
-/// Compares the maps of the recording `before` with those of `after`; keeps the `worst` maps that changed most.
+/// Compares the maps of the recording `before` with the maps of `after`; keeps the `worst` maps that changed most.
 ///
 /// # Errors
 /// [`CompareError::Recording`] if a file cannot be read, [`CompareError::Misfit`] if the configuration names other
@@ -206,7 +206,7 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
         After::Config { given, recorded } => {
             let boot_id = recording.header().boot_id;
             let mut vehicles = pipelines(before, boot_id, given, recorded)?;
-            // Without recorded maps those of the recorded configuration are made too.
+            // Without recorded maps, the maps of the recorded configuration are computed too.
             let mut recorded = match recording.maps() {
                 RecordedMaps::Full => Vec::new(),
                 RecordedMaps::Digest | RecordedMaps::None => pipelines(before, boot_id, recorded, recorded)?,
@@ -386,7 +386,7 @@ impl Pairs {
     }
 }
 
-/// Inserts a map that changed into the list of those that changed most, of at most `length`.
+/// Inserts a changed map into the list of the most changed maps, at most `length` maps.
 fn keep_worst(worst: &mut Vec<MapChange>, one: MapChange, length: usize) {
     if one.changed == 0 {
         return;

@@ -35,7 +35,7 @@ pub(super) enum Format {
 }
 
 impl Header {
-    /// Adds metadata, if it is that of a recording.
+    /// Adds the metadata `clearway` of a recording; ignores metadata of other programs.
     pub(super) fn add_metadata(&mut self, metadata: &Metadata) {
         if metadata.name == METADATA {
             self.metadata.clone_from(&metadata.metadata);

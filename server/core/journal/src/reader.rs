@@ -121,7 +121,7 @@ impl Beginning {
     /// Reads a recording up to its first map.
     ///
     /// # Errors
-    /// As [`RecordingReader::open`], and those of its messages.
+    /// As [`RecordingReader::open`], and the errors of the recording's messages.
     pub fn of(file: &Path) -> Result<Self, RecordingError> {
         let mut beginning = Self::default();
         for message in RecordingReader::open(file)? {
@@ -273,12 +273,12 @@ impl RecordingReader {
             }
             Content::Digest { vehicle, layer } => {
                 let (vehicle, layer) = (vehicle.clone(), layer.clone());
-                // One that cannot be decoded differs from every map.
+                // A digest that cannot be decoded differs from every map.
                 let digest = v1::MapDigest::decode(bytes).unwrap_or_default();
                 Some(Ok(RecordedMessage::Digest { vehicle, layer, digest }))
             }
             Content::Keyframe { vehicle } => {
-                // One that cannot be decoded leaves the maps after it unjudged.
+                // A keyframe that cannot be decoded leaves the maps after it unjudged.
                 let keyframe = v1::Keyframe::decode(bytes).ok()?;
                 Some(Ok(RecordedMessage::Keyframe { vehicle: vehicle.clone(), keyframe }))
             }

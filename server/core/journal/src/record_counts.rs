@@ -1,5 +1,5 @@
-//! The records of an MCAP file -> how many it has, and how many it should have by its own counts: those of its summary,
-//! and of a recording those of the recorder.
+//! The records of an MCAP file -> how many it has, and how many it should have by the counts in its summary and, in a
+//! recording, by the recorder's counts.
 
 use std::collections::BTreeMap;
 
@@ -44,8 +44,8 @@ impl RecordCounts {
         self.recorder = Some(counts).filter(|counts| counts.closed);
     }
 
-    /// Ends the counting. The counts of the summary can be used from here on, if they are `sound`; those of the
-    /// recorder unless a repaired file has them of the file before.
+    /// Ends the counting. From here on the summary's counts can be used if they `are_sound`, and the recorder's counts
+    /// unless the file `is_repaired`: then they count the damaged file.
     pub(super) fn end(&mut self, are_sound: bool, is_repaired: bool) {
         self.has_ended = true;
         self.stated = self.stated.take().filter(|_| are_sound);
@@ -67,7 +67,7 @@ impl RecordCounts {
         self.recorder.iter().flat_map(|counts| &counts.topics).any(|topic| topic.dropped > 0)
     }
 
-    /// The topics of which more or fewer messages were read than the file states; `None` if it does not state it.
+    /// The topics whose number of read messages differs from the stated number; `None` if the file states no numbers.
     fn differing(&self, topic: impl Fn(u16) -> String) -> Option<Vec<Missing>> {
         let mut read: BTreeMap<String, u64> = BTreeMap::new();
         self.messages.iter().for_each(|(id, count)| *read.entry(topic(*id)).or_default() += count);

@@ -186,7 +186,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
     Ok(report)
 }
 
-/// The texts of those damages that are losses.
+/// The texts of the damages that are losses.
 fn losses(damages: &[Damage]) -> Vec<String> {
     damages.iter().filter(|damage| damage.is_loss).map(ToString::to_string).collect()
 }

@@ -1,10 +1,10 @@
 //! Verifies a recording: are the recorded maps the maps of the recorded events?
 //!
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
-//! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one.
+//! journal, and compares the bytes of each map with the recorded map's bytes, or their digest with the recorded digest.
 //! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which
-//! the file lacks are counted as unjudged: those after a gap, until the next keyframe; and if messages of the file are
-//! missing or not in their place, all recorded maps without a computed one, and the reverse.
+//! the file lacks are counted as unjudged: the maps after a gap, until the next keyframe; and if messages of the file
+//! are missing or not in their place, all recorded maps without a computed map, and the reverse.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -39,11 +39,11 @@ pub struct Report {
     pub events: u64,
     /// What the recording holds of the maps. Without any, only its events are checked.
     pub recorded: RecordedMaps,
-    /// Number of recorded maps or digests, of one layer each, that equal those of the computed map byte for byte.
+    /// Number of recorded maps or digests, of one layer each, that equal the computed map or digest byte for byte.
     pub equal: u64,
     /// Number of maps computed from the events.
     pub maps: u64,
-    /// Number of cells of the recorded maps that have a computed map: those of their layers' grids.
+    /// Number of cells in the grids of all recorded maps that have a computed map.
     pub cells: u64,
     /// True if a crash cut the file; then the part before the cut is verified.
     pub cut: bool,
@@ -294,7 +294,7 @@ impl VehicleReplay {
         }
     }
 
-    /// Compares a recorded digest with that of the computed layer.
+    /// Compares a recorded digest with the computed layer's digest.
     fn compare_digest(&mut self, layer: &str, digest: v1::MapDigest, report: &mut Report) {
         let v1::MapDigest { header, sha256: recorded } = digest;
         let sequence = header.as_ref().map_or(u64::MAX, |header| header.sequence);
