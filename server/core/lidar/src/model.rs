@@ -1,6 +1,6 @@
 //! The Velodyne models and their properties: lasers, blocks, timing, resolution.
 //!
-//! All values are those of the manuals, none is measured here. The decoder uses them, and so does the encoder of a
+//! All values come from the manuals, none is measured here. The decoder uses them, and so does the encoder of a
 //! simulated sensor. Sources: HDL-64E S2/S3 manual (63-HDL64ES3 rev K, appendices E to G), HDL-32E application note
 //! 63-9277, VLP-16 manual 63-9243 rev E, VLP-32C manual 63-9325, VLS-128 manual 63-9480, and VeloView for the pauses
 //! between groups of lasers of a VLS-128.
@@ -80,7 +80,7 @@ pub struct ModelSpec {
     pub firing_period_ns: u32,
     /// Time from one firing to the next in dual-return mode, in ns.
     pub firing_period_dual_ns: u32,
-    /// Values of byte 1205 that sensors of this model send; the first is that of the manual. Empty for an HDL-64E,
+    /// Values of byte 1205 that sensors of this model send; the first value is the manual's. Empty for an HDL-64E,
     /// whose last two bytes are status bytes.
     pub model_bytes: &'static [u8],
     /// True if the model has a dual-return mode.

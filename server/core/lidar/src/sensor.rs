@@ -179,7 +179,7 @@ impl Sensor {
     /// may follow.
     pub fn finish(&mut self) -> Option<&Revolution> {
         if self.decoder.is_none() && !self.waiting.is_empty() {
-            // There are too few packets to measure their rate, so the model is that of the byte.
+            // There are too few packets to measure their rate, so the model byte decides.
             self.start(Model::Hdl32e, None).ok()?;
         }
         let decoder = self.decoder.as_mut()?;

@@ -250,7 +250,7 @@ impl Decoder {
         Some(measured.filter(|step| possible.contains(step)).unwrap_or(nominal))
     }
 
-    /// Number of packets from the one that began at azimuth `before` to this one, from the angle between them.
+    /// Number of packets from the packet that began at azimuth `before` to this packet, by the angle between them.
     fn packets_since(&self, before: Option<u32>, packet: &Packet<'_>) -> i64 {
         let turned = before.map_or(0, |before| forward(before, packet.azimuth(0)));
         let by_rate =

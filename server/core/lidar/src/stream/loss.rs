@@ -102,7 +102,7 @@ impl Loss {
         self.fov_gap.is_some_and(|sector| sector.is_about(&step, FOV_GAP_ERROR_PACKETS * span))
     }
 
-    /// Number of packets that were lost so far, without those of a candidate.
+    /// Number of packets lost so far, without the packets of a candidate gap.
     pub fn lost(&self) -> u64 {
         self.lost
     }
@@ -124,7 +124,7 @@ impl EmptySector {
         forward(self.from, self.to)
     }
 
-    /// True if both ends are those of `other`, ± `reach` counts.
+    /// True if both ends equal the ends of `other`, ± `reach` counts.
     fn is_about(&self, other: &EmptySector, reach: u32) -> bool {
         is_near(self.from, other.from, reach) && is_near(self.to, other.to, reach)
     }
