@@ -103,7 +103,7 @@ impl Grpc {
             let allowed = "no name without grpc.tls.client_ca, the CA of the clients' certificates";
             return Err(ValueError::new("grpc.access", name, allowed));
         }
-        // A misspelt name would leave the one that was meant without a limit.
+        // A misspelt name would leave the client that was meant without a limit.
         let has_access = |name: &String| {
             readers.iter().chain(ingesters).chain(operators).chain(tokens.keys()).any(|other| other == name)
         };

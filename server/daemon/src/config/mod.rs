@@ -383,8 +383,8 @@ fn refused(refusal: Refusal, origin: Origin) -> ConfigError {
 }
 
 impl Config {
-    /// The configuration with those of `old`'s values that a running server can replace: certificates, tokens, roles
-    /// and limits. It equals `old` if nothing else differs.
+    /// This configuration with `old`'s certificates, tokens, roles and limits, which a running server can replace. It
+    /// equals `old` if nothing else differs.
     pub fn without_reloaded(mut self, old: &Self) -> Self {
         self.grpc.tls.clone_from(&old.grpc.tls);
         self.grpc.access.clone_from(&old.grpc.access);

@@ -28,7 +28,7 @@ pub enum Colours {
     None,
 }
 
-/// True if the values of a channel are ids, of which only equality means something.
+/// True if the values of a channel are ids: only their equality means something.
 fn is_id(channel: &Channel) -> bool {
     channel.unit == "id"
 }

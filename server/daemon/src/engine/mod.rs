@@ -68,7 +68,7 @@ pub struct Engine {
     pub observer: Option<Observer>,
     /// The newest event with a plan, as it is recorded; `None` before the first.
     pub plan: Option<Bytes>,
-    /// How the header of the next map differs from that of a live one; `None` if it does not.
+    /// How the header of the next map differs from a live map's header; `None` if it does not.
     pub replayed: Option<Replayed>,
 }
 

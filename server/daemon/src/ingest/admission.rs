@@ -155,7 +155,7 @@ impl<S> SourceQueue<S> {
     }
 }
 
-/// The hosts with open streams, of which a vehicle or a server has a limited number.
+/// The open streams of a vehicle or of a server by host, limited in number for each host and for all.
 #[derive(Debug)]
 pub struct StreamLimits {
     /// Greatest number of open streams of all hosts.
@@ -192,7 +192,7 @@ pub enum StreamLimitError {
 }
 
 impl StreamLimits {
-    /// At most `streams_max` streams, of which a host never has `kept`; the only stream is for any host.
+    /// At most `streams_max` streams; one host has at most all but `kept` of them, and may always have one.
     pub fn new(streams_max: usize, kept: usize) -> Self {
         Self { streams_max, host_max: streams_max.saturating_sub(kept).max(1), hosts: Mutex::default() }
     }

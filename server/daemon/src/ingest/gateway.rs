@@ -210,8 +210,8 @@ impl Gateway {
         });
     }
 
-    /// Pushes the declaration of a new sensor, or of one that exists already. The configuration here changes as the
-    /// engine's will, so that the next observation can name the sensor.
+    /// Pushes the declaration of a new or an existing sensor. The configuration here changes as the engine's will, so
+    /// that the next observation can name the sensor.
     fn push_declaration(
         &self,
         captured_ns: Option<i64>,

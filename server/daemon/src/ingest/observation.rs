@@ -57,7 +57,7 @@ pub enum ObservationError {
         /// [`Limits::message_bytes_max`].
         bytes_max: usize,
     },
-    /// The observation has no body, or one that this version does not have.
+    /// The observation has no body, or a body that this version does not know.
     #[error("observation without a body: scan, ego_pose, road, packets, end or declaration is allowed")]
     Body,
     /// A packed list ends within a number.
@@ -195,7 +195,7 @@ pub fn decode(observation: v1::Observation, limits: &Limits) -> Result<Bodies, O
 }
 
 /// Returns `bodies` if no stamp in them is too far ahead of the server's clock `now_ns`. A stamp of the past is
-/// allowed: it may be that of an old drive, and a map never looks younger by it.
+/// allowed: it may come from an old drive, and a map never looks younger by it.
 ///
 /// # Errors
 /// [`ObservationError::StampAhead`] with the first stamp that is.

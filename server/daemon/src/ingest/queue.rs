@@ -26,7 +26,7 @@ use crate::base::sync::locked;
 const REPORT_PERIOD_NS: u64 = 100_000_000;
 
 /// Greatest age of a datagram by the kernel's stamp, in ns. Ours: no server stands still for longer and goes on; a
-/// stamp that differs by more is that of a clock that was set between the kernel's stamp and the reading.
+/// stamp that differs by more comes from a clock that was set between the kernel's stamp and the reading.
 const RECEIVED_AGE_NS_MAX: i64 = 60_000_000_000;
 
 /// An event without its number: what a source of readings yields.
@@ -191,7 +191,7 @@ impl EventQueue {
         self.clock.now_ns()
     }
 
-    /// Pushes an event that is no reading, if the queue has space. Its stamp is that of the newest event, so that the
+    /// Pushes an event that is no reading, if the queue has space. Its stamp is the newest event's stamp, so that the
     /// time of a captured drive does not jump. Never waits, and counts nothing: the caller tries again. True if the
     /// event is on the queue.
     pub fn push_if_space(&self, source: u16, body: Body) -> bool {

@@ -9,7 +9,7 @@
 //!
 //! With roles ([`Senders`]) a sample needs a certificate with the role of an ingester, as over gRPC. zenoh's access
 //! control refuses the others first; this check also holds if it is configured otherwise. Without roles a sender may
-//! name any session, also that of another sender.
+//! name any session, also another sender's session.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};

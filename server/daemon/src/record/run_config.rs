@@ -185,7 +185,7 @@ fn is_same_value(recorded: &toml::Value, constant: &str) -> bool {
 }
 
 /// Sets the rules of a run that was recorded before they could be configured. A recorded configuration is complete, so
-/// a table that it lacks is one that its program did not have.
+/// its program did not have a table that it lacks.
 fn use_rules_of_the_run(config: &mut Config, text: &str) {
     let document: toml::Table = text.parse().unwrap_or_default();
     let recorded = document.get("vehicle").and_then(toml::Value::as_array).into_iter().flatten();

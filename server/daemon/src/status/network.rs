@@ -13,7 +13,7 @@ const AWAY_NAMED_AFTER: Duration = Duration::from_secs(2);
 /// Time before the end of a certificate at which that is named. Ours: a week to write a new one.
 const END_NAMED_BEFORE: Duration = Duration::from_secs(7 * 24 * 3600);
 
-/// The zenoh routers of which none is connected.
+/// The configured zenoh routers, while none of them is connected.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Away {
     /// Since when.

@@ -412,8 +412,8 @@ impl VehicleStatus {
     }
 }
 
-/// The counts of packets of which the loss is computed, with the ledgers of the sensors: packets of unknown senders and
-/// copies of packets are not expected.
+/// The counts of packets from which the loss is computed, with the ledgers of the sensors: packets of unknown senders
+/// and copies of packets are not expected.
 pub(super) fn packet_counts(sensors: &[NamedStatus]) -> PacketCounts {
     let sum = |count: fn(&NamedStatus) -> u64| sensors.iter().map(count).sum();
     PacketCounts {

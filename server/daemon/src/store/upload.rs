@@ -1,6 +1,6 @@
 //! Finished parts of a folder -> the store, confirmed.
 //!
-//! A part is confirmed when it was read back from the store, its CRC was that of the file, and its index was written
+//! A part is confirmed when it was read back from the store, its CRC equalled the file's CRC, and its index was written
 //! after it. A file beside the part, `<part>.confirmed`, then says so; it is what makes the part deletable. A crash
 //! between two steps repeats them: the name of a part has its CRC, so it is never written with other contents.
 

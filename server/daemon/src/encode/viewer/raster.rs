@@ -24,7 +24,7 @@ use nalgebra::{Isometry3, Vector3};
 
 use crate::encode::colours::Colours;
 
-/// Edge of the cells to which radial layers are resampled, in metres: that of the other layers.
+/// Edge of the cells to which radial layers are resampled, in metres, equal to the cells of the other layers.
 const CELL_M: f64 = 0.25;
 /// Most square cells from the vehicle to the edge; larger grids get larger cells.
 const CELLS_MAX: f64 = 1000.0;

@@ -12,7 +12,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 pub const LAYER: &str = "safe_path";
 /// Width of the links' lines in metres.
 pub const LINK_M: f64 = 0.15;
-/// Red, green, blue and opacity of the links' lines: those of the page.
+/// Red, green, blue and opacity of the links' lines, as on the page.
 pub const LINK_RGBA: [f32; 4] = [1.0, 0.88, 0.3, 1.0];
 /// Width of the circles' lines in metres.
 pub const CIRCLE_M: f64 = 0.05;

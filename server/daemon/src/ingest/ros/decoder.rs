@@ -243,7 +243,7 @@ impl TopicDecoder {
         Err(RosMessageError::OtherFixedFrame { fixed_frame, found })
     }
 
-    /// An odometry without a child frame is that of the vehicle.
+    /// An odometry without a child frame describes the vehicle.
     fn pose_of_odometry(&mut self, odometry: &Odometry) -> Result<Option<EgoPose>, RosMessageError> {
         let StampedTransform { header, child_frame_id, parent_from_child } = &odometry.transform;
         self.check_fixed_frame(header.frame_id)?;
@@ -255,7 +255,7 @@ impl TopicDecoder {
         let Some(Twist { linear_mps, angular_rps }) = odometry.twist else {
             return Ok(self.pose_with_speed(header.stamp_ns, map_from_ego));
         };
-        // The twist is that of the child frame; while it rotates, a point at a distance from it moves as well.
+        // The twist describes the child frame; while it rotates, a point at a distance from it moves as well.
         let from_rotation = Vector3::from(angular_rps).cross(&child_from_ego.translation.vector);
         let velocity = child_from_ego.rotation.inverse() * (Vector3::from(linear_mps) + from_rotation);
         Ok(Some(EgoPose { stamp_ns: header.stamp_ns, map_from_ego, speed_mps: velocity.x }))
@@ -276,7 +276,7 @@ impl TopicDecoder {
     }
 
     /// Inserts transforms into the tf tree. Returns the vehicle's pose if they move it. The nearest moving transform
-    /// above the vehicle's frame gives the stamp, because transforms farther up (those of a localisation) are rare, and
+    /// above the vehicle's frame gives the stamp, because transforms farther up (from a localisation) are rare, and
     /// some programs stamp them in advance.
     fn insert_transforms(
         &mut self,

@@ -268,7 +268,7 @@ mod tests {
         assert!(credits.left() && credits.in_flight.is_empty());
     }
 
-    /// Stamps of the maps that are sent, of those made at `stamps`.
+    /// Stamps of the sent maps, if maps are made at `stamps`.
     fn selected(hz: f64, stamps: impl IntoIterator<Item = i64>) -> Vec<i64> {
         let mut rate = Rate::new(Some(hz)).unwrap();
         let due = |stamp: &i64| {
@@ -301,7 +301,7 @@ mod tests {
     #[test]
     fn maps_left_out_by_the_rate_are_counted_apart_from_missed_ones() {
         let rate = Rate::new(Some(5.0)).unwrap();
-        // Away for 2 s of 10 Hz maps: 19 in between, for 9 of which 5 Hz had room.
+        // Away for 2 s of 10 Hz maps: 19 maps in between; 5 Hz had room for 9 of them.
         assert_eq!(rate.room(19, [0, 2000 * MS]), 9);
         assert_eq!(Rate::new(None).unwrap().room(19, [0, 2000 * MS]), 19);
         assert_eq!(rate.room(2, [0, 2000 * MS]), 2, "no more than there were");

@@ -91,7 +91,7 @@ pub enum Protocol {
     /// HTTP/2 with gRPC: refusals are a gRPC status.
     Grpc,
     /// HTTP/1 for browsers and programs: refusals are a status and a text. Pages of these origins may connect, beside
-    /// the server's own and those of the configuration.
+    /// the server's own pages and the configured origins.
     Web(&'static [&'static str]),
 }
 

@@ -1,7 +1,7 @@
 //! How well a vehicle is served: what is known of it at one time -> `ok`, `warn` or `error`, with reasons in words.
 //!
 //! Pure: [`findings`] is a function of [`Facts`], and [`Health`] adds what is remembered from one assessment to the
-//! next. A state that gets worse is believed at once, one that gets better only after [`BETTER_AFTER`].
+//! next. A worse state is believed at once, a better state only after [`BETTER_AFTER`].
 
 use std::time::Duration;
 
@@ -244,7 +244,7 @@ fn expects_data(facts: &Facts) -> bool {
     facts.replay.is_none_or(plays)
 }
 
-/// Sensors of which nothing arrives. One of several is a warning, because the others make maps.
+/// Sensors from which nothing arrives. One silent sensor of several is a warning, because the others make maps.
 fn silence(facts: &Facts, add: &mut impl FnMut(State, String)) {
     if !expects_data(facts) {
         return;
