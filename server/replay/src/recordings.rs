@@ -57,7 +57,7 @@ pub(super) fn files_of_vehicle(options: &ReplayOptions, files: &Readings) -> Res
     Ok(Some(of_vehicle.into_iter().map(|recording| recording.file).collect()))
 }
 
-/// Refuses a configuration whose vehicle or sensors are not those of the recording: events name a sensor by its place.
+/// Refuses a configuration whose vehicle or sensors differ from the recording's: events name a sensor by its place.
 pub(super) fn check_sensors(file: &Path, config: &Config, recording: &Path) -> Result<(), ReplayError> {
     let recording = RecordingReader::open(recording)?;
     if recording.header().config.is_none() {

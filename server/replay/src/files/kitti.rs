@@ -44,7 +44,7 @@ pub fn read(file: &Path, index: u64) -> Result<Reading, ScanError> {
     read_with_format(file, index).map(|(_, reading)| reading)
 }
 
-/// Reads one scan, with the format of its file; its stamp is that of [`read`].
+/// Reads one scan as [`read`] does, with the format of its file.
 ///
 /// # Errors
 /// [`ScanError::Read`] if the file cannot be read, [`ScanError::Scan`] if it has no valid scan.

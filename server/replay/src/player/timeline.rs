@@ -124,7 +124,7 @@ enum Item {
     End(Remarks),
 }
 
-/// The readings of all vehicles, of which the next one may be looked at before it is taken.
+/// The readings of all vehicles. The next reading can be looked at before it is taken.
 pub struct Ahead {
     readings: Receiver<Result<Item, FilesError>>,
     next: Option<TimedReading>,
@@ -159,7 +159,7 @@ impl Ahead {
     }
 }
 
-/// The readings of several vehicles, each with the one that is next.
+/// The readings of several vehicles, each vehicle with its next reading.
 struct Merged {
     tracks: Vec<(Readings, Option<Reading>)>,
     faults: Faults,
@@ -183,7 +183,7 @@ impl Merged {
         Ok(None)
     }
 
-    /// The earliest of the vehicles' next readings; of equal times that of the first vehicle.
+    /// The earliest of the vehicles' next readings; at equal times the reading of the first vehicle.
     fn earliest(&mut self) -> Result<Option<TimedReading>, FilesError> {
         for (readings, next) in &mut self.tracks {
             if next.is_none() {

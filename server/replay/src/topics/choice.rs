@@ -104,7 +104,8 @@ impl AvailableTopics {
         let mut sensors: Vec<SensorTopic> =
             sensors.into_iter().map(|topic| self.sensor_topic(topic, &ego_frame)).collect();
         if !is_requested && sensors.iter().all(|sensor| sensor.ego_from_sensor.is_none()) {
-            // A replay can use one sensor that is not placed: the one that shows most, whichever sent first.
+            // A replay can use one sensor without extrinsics: the sensor with packets or most points, whichever sent
+            // first.
             let shown = |sensor: &SensorTopic| {
                 let found = &self.topics[&sensor.topic];
                 (found.kind == Kind::VelodyneScan, found.points)
@@ -121,8 +122,8 @@ impl AvailableTopics {
         Ok(TopicChoice { sensors, pose, ego_frame, fixed_frame, notes, latched: self.latched.clone() })
     }
 
-    /// The vehicle's frame: of those in the tf tree the one to which the frame of a sensor is joined; without tf the
-    /// child frame of the first odometry, else `base_link`.
+    /// The vehicle's frame: the frame of the tf tree to which the frame of a sensor is joined; without tf the child
+    /// frame of the first odometry, else `base_link`.
     fn ego_frame(&self) -> String {
         let names = self.frames.names();
         let candidates: Vec<&str> = EGO_FRAMES
