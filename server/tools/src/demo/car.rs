@@ -86,7 +86,7 @@ impl DemoCar {
         self.sensors.iter().any(JoinHandle::is_finished) || self.observer.is_finished()
     }
 
-    /// Simulated time skipped so far, because the machine is too slow: that of the sensor that skipped most.
+    /// Simulated time skipped so far by the sensor that skipped most, because the machine is too slow.
     pub fn skipped(&self) -> Duration {
         self.skipped.iter().map(Skipped::time).max().unwrap_or_default()
     }

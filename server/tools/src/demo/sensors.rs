@@ -49,7 +49,7 @@ const SHARE_MAX: f64 = 0.25;
 const MEASURED: Duration = Duration::from_millis(200);
 
 impl SensorChoice {
-    /// The model that `sensors` names, or the one that this machine can afford.
+    /// The model that `sensors` names, or a model that this machine can afford.
     pub fn new(sensors: DemoSensors) -> Self {
         let given = |model| Self { model, core_shares: Vec::new() };
         match sensors {

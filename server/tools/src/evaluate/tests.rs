@@ -174,7 +174,7 @@ fn each_variation_has_a_row_and_its_points_are_written() {
     let rows = &report.sources[0].rows;
     let names: Vec<(&str, bool)> = rows.iter().map(|row| (row.name.as_str(), row.final_only)).collect();
     assert_eq!(names, [("bend-6", false), ("roll+3", false), ("offset+1.5", false)]);
-    // The truth is that of the scan as recorded, so as many points of it are road and wall.
+    // The truth comes from the scan as recorded, so as many points of it are road and wall.
     let scored = |row: &report::EvaluatedRow| row.layer("drivability").unwrap().points[0];
     for row in rows {
         let ground = scored(row).right + scored(row).missed;

@@ -179,7 +179,7 @@ impl ExportOptions {
 /// Exports the maps of a recording. `progress` is called with the bytes read and the number of maps exported.
 ///
 /// # Errors
-/// If a file cannot be read or written; for an unknown layer or vehicle with the names of those in the recording.
+/// If a file cannot be read or written; for an unknown layer or vehicle, with the names in the recording.
 pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Result<Exported> {
     let ExportOptions { recording: file, out, .. } = options;
     files::open(file)?;

@@ -1,7 +1,7 @@
 //! The events of a recording -> the scans of each sensor, decoded again: points in the sensor frame.
 //!
-//! The sensors are those of the recorded configuration and calibrations. The points are not compensated for the motion
-//! of the vehicle, and those that the maps leave out (the vehicle itself, blind sectors) are in the scans.
+//! The sensors come from the recorded configuration and calibrations. The points are not compensated for the motion of
+//! the vehicle, and include points that the maps leave out (the vehicle itself, blind sectors).
 
 use std::collections::BTreeMap;
 
