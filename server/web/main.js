@@ -30,7 +30,7 @@ let is_draw_scheduled = false, wall_minus_monotonic = Date.now() - performance.n
 let link = { phase: "connecting", text: "Connecting …" }, retry_at_ms = 0;
 let names = null;
 
-// Times of the Worker are those of this thread's clock, from the Unix epoch.
+// A time of the Worker, from the Unix epoch -> the same time on this thread's clock.
 const local = (absolute_ms) => absolute_ms - performance.timeOrigin;
 
 const FROM_WORKER = {
