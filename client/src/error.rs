@@ -5,7 +5,7 @@ use clearway_proto::plan::PlanError;
 
 use crate::footprint::shape::ShapeError;
 
-/// Why a call failed. `address` is that of the server or router, as the client connected to it.
+/// Why a call failed. `address` is the server's or router's address, as the client connected to it.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum ClientError {
     /// The text is not an address.

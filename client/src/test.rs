@@ -1,9 +1,9 @@
 //! For tests of planners: a recording -> a server of its own process that replays it as if live (feature `test`).
 //!
-//! The command `clearway` is the one that the environment variable `CLEARWAY` names, else the one that cargo built
-//! beside the test, else the installed one. The stamps of the maps are shifted to the present, so that their ages are
-//! as on the vehicle. The drive begins when the first reader has subscribed; after its end the last map stays, and
-//! becomes stale. [`Client::replay_control`] pauses, steps and seeks.
+//! The command `clearway` is the command that the environment variable `CLEARWAY` names, else the command that cargo
+//! built beside the test, else the installed command. The stamps of the maps are shifted to the present, so that their
+//! ages are as on the vehicle. The drive begins when the first reader has subscribed; after its end the last map stays,
+//! and becomes stale. [`Client::replay_control`] pauses, steps and seeks.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -65,7 +65,7 @@ struct SafePoint {
 }
 
 impl Follower {
-    /// Replaces the safe points by those of a map with the layer `safe_path`.
+    /// Replaces the safe points by the points of a map with the layer `safe_path`.
     pub fn update(&mut self, map: &MapView) -> Result<(), ClientError> {
         let layer = map.layer("safe_path")?;
         self.ego = ego_pose(map).unwrap_or_default();

@@ -1,8 +1,7 @@
 //! Maps with the layer `freespace` -> the next move, by the layer's answers alone.
 //!
-//! In: maps, a goal. Out: the next [`Move`]: of several arcs the one that comes nearest to the goal before anything
-//! forbids it. Low things forbid it too. The map answers for the whole vehicle, so the planner keeps no grid of its
-//! own.
+//! In: maps, a goal. Out: the next [`Move`]: the arc that comes nearest to the goal before anything forbids it. Low
+//! things forbid it too. The map answers for the whole vehicle, so the planner keeps no grid of its own.
 
 use clearway_client::{Along, ClientError, MapView, Outline, Path};
 

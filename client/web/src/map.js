@@ -17,7 +17,7 @@ export function openUpdate(message, base = null) {
   return { ...update, map: new LiveMap(update.map, base) };
 }
 
-// A map of which only the header and the layers' names are read at first.
+// A map; at first only its header and the layers' names are read.
 export class LiveMap {
   // By name: a Layer message, or its bytes.
   #sources = new Map();
