@@ -187,7 +187,7 @@ impl SimulatedVehicle {
         }
         let firings = revolutions * revolution_ns / self.scanner.firing_ns(1) as f64;
         let before = self.next_firing;
-        // One packet after the first one that begins no earlier than this angle: that may still hold the end.
+        // One packet after the first packet that begins no earlier than this angle: it may still hold the end.
         self.move_to(before + firings as i64 + 2 * self.firings_per_packet());
         let skipped_ns = self.scanner.firing_ns(self.next_firing - before);
         Duration::from_nanos(skipped_ns.unsigned_abs())

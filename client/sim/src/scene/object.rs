@@ -203,8 +203,8 @@ fn entry(from: f64, to: f64) -> Option<f64> {
 pub struct Object {
     /// Kind of the object.
     pub kind: Kind,
-    /// Shape of the object, in the world frame. That of a driving object is in its own frame (x forward, y left, z over
-    /// the ground).
+    /// Shape of the object, in the world frame. The shape of a driving object is in its own frame (x forward, y left, z
+    /// over the ground).
     pub shape: Shape,
     /// Reflectivity, 0 to 255.
     pub reflectivity: u8,

@@ -1,7 +1,7 @@
 //! The truth about drivable ground, computed from the world itself, with which maps are compared.
 //!
-//! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits are
-//! those of the UT Austin thesis, section IV: a step of one unit (0.25 m), a clearance of 2.5 m, passages 3 m wide
+//! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits come
+//! from the UT Austin thesis, section IV: a step of one unit (0.25 m), a clearance of 2.5 m, passages 3 m wide
 //! (criterion 3).
 
 use nalgebra::{Isometry3, Point3};

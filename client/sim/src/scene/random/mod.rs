@@ -4,7 +4,7 @@
 //! mount of a sensor. The same seed gives the same world. Seeds 0 to 155 have every form with every theme once in the
 //! even seeds and once in the odd seeds.
 //!
-//! Parameters are tuned on even seeds only; figures of odd seeds are then those of worlds that were not tuned on.
+//! Parameters are tuned on even seeds only; figures of odd seeds are then figures of worlds that were not tuned on.
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -43,7 +43,7 @@ pub struct RandomWorld {
     pub theme: Theme,
     /// What was drawn, with its measures.
     pub description: String,
-    /// The world, in which the vehicle stands still. Its name is that of the theme.
+    /// The world, in which the vehicle stands still. Its name is the theme's name.
     pub scene: Scene,
     /// Mount of the sensor: 1.6 to 2.2 m over the ground, up to 1.5 m ahead of the ego frame's origin and up to 0.3 m
     /// beside it.
