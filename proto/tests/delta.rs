@@ -29,7 +29,7 @@ fn bytes(header: &v1::Header, layer: &v1::Layer) -> Bytes {
     [map::encode_header(header), map::encode_layer(layer)].concat().into()
 }
 
-/// Raw value of a cell of an endless grid at a time: patches, of which few change from one time to the next.
+/// Raw value of a cell of an endless grid at a time: patches; few change from one time to the next.
 fn world(seed: u64, time: u64, ix: i64, iy: i64) -> u16 {
     let hash = |a: i64, b: i64, c: u64| {
         let mut h =

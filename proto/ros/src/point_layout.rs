@@ -18,7 +18,7 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    /// Finds the fields; appends the optional ones that cannot be read to `refused`.
+    /// Finds the fields; appends the optional fields that cannot be read to `refused`.
     pub fn from_cloud(cloud: &PointCloud2, refused: &mut Vec<RefusedPart>) -> Result<Self, MessageError> {
         let mut used = Vec::new();
         let mut position = [FieldReader { offset: 0, datatype: Datatype::Float32, big_endian: false }; 3];

@@ -41,8 +41,7 @@ pub struct Encoded {
 }
 
 impl Encoded {
-    /// The channel message. A cell's value in `unit` is `raw * scale`; `unknown` is the raw value of a cell of which
-    /// nothing is known.
+    /// The channel message. A cell's value in `unit` is `raw * scale`; `unknown` is the raw value of an unknown cell.
     pub fn into_channel(self, name: &str, unit: &str, scale: f32, unknown: i32) -> v1::Channel {
         v1::Channel {
             name: name.into(),

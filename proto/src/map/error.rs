@@ -106,7 +106,7 @@ pub enum MapError {
         /// The map that was given.
         given: Box<MapId>,
     },
-    /// The cells of a delta cannot be compared with those of its base layer.
+    /// The cells of a delta cannot be compared with the cells of its base layer.
     #[error("layer {layer:?} is a delta that does not fit its base: {source}")]
     BaseShape {
         /// Name of the layer.

@@ -1,6 +1,6 @@
 //! The published message types: their names, their names in rmw_zenoh, and their definitions for MCAP files.
 //!
-//! Hashes are RIHS01 (REP-2016), equal from Iron to Jazzy. Definitions are those of `common_interfaces` and `geometry2`
+//! Hashes are RIHS01 (REP-2016), equal from Iron to Jazzy. Definitions come from `common_interfaces` and `geometry2`,
 //! without comments, each followed by the definitions of its members (MCAP's `ros2msg`).
 //!
 //! | file | in -> out |
