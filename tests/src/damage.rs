@@ -174,7 +174,7 @@ impl Original {
     }
 }
 
-/// A copy of a recording, one bit of which is changed at a time.
+/// A copy of a recording with one bit changed at a time.
 pub struct Copy {
     file: PathBuf,
 }

@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// A group of tests of which one runs at a time.
+/// A group of tests that run one at a time.
 pub struct SerialGroup(Mutex<()>);
 
 /// A browser without a graphics card draws with all processors: beside a second one it answers a click after half a

@@ -101,7 +101,7 @@ pub fn reset(stream: u32) -> Vec<u8> {
 /// Opens `connections` connections with `streams` streams of maps each, and the largest windows; nothing is ever read.
 ///
 /// # Errors
-/// If the server does not accept a connection; one that it closes afterwards is no error.
+/// If the server does not accept a connection; a connection that it closes afterwards is no error.
 pub async fn never_read(address: SocketAddr, connections: usize, streams: u32) -> io::Result<Vec<TcpStream>> {
     let mut held = Vec::new();
     for _ in 0..connections {

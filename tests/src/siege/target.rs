@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use futures::future::BoxFuture;
 use tokio::net::{TcpSocket, TcpStream};
 
-/// The address that TCP attacks come from: another one than that of the honest peers, because limits are by address.
+/// The address that TCP attacks come from: not the address of the honest peers, because limits are by address.
 const ATTACKER: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
 /// Where the server under attack listens.

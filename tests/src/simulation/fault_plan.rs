@@ -46,7 +46,7 @@ pub enum InjectedFault {
     LostOutcome,
     /// A sensor sends nothing more, and does not recover.
     SilentSensor,
-    /// The stamp of a map equals that of the map before.
+    /// The stamp of a map equals the stamp of the map before.
     StuckStamp,
 }
 

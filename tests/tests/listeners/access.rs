@@ -69,7 +69,7 @@ enum Attempt {
     Query(&'static str),
     /// Sees the liveliness tokens of a key.
     Liveliness(&'static str),
-    /// Sends an observation on a key over zenoh, of which the server gives an account.
+    /// Sends an observation on a key over zenoh, which the server then acknowledges or refuses.
     Observe(&'static str),
     /// Sends a plan over zenoh that the server takes.
     Plan,
@@ -300,7 +300,7 @@ async fn bed(folder: &Path) -> Bed {
     let running = start(config).await;
     let port = running.zenoh[0].rsplit_once(':').expect("an endpoint").1.to_owned();
     let zenoh = format!("tls/localhost:{port}");
-    // Each in a task of its own: one that is refused takes its time.
+    // Each in a task of its own: a refused session takes its time.
     let opened = join_all(CALLERS.map(|caller| tokio::spawn(session(zenoh.clone(), caller.certificate)))).await;
     let named = CALLERS.iter().map(|caller| caller.name).zip(opened);
     let sessions = named.filter_map(|(name, session)| Some((name, session.expect("no panic")?))).collect();

@@ -62,7 +62,7 @@ impl Browser {
         browser
     }
 
-    /// A Chromium like that of a phone: touch, and two pixels for each CSS pixel.
+    /// A Chromium as on a phone: touch, and two pixels for each CSS pixel.
     pub fn start_phone(width: u32, height: u32) -> Self {
         let metrics = json!({ "width": width, "height": height, "pixelRatio": 2, "touch": true });
         Self::begin(width, height, json!({ "deviceMetrics": metrics }), &[])
