@@ -29,7 +29,7 @@ pub enum After<'a> {
     Config {
         /// The configuration of each recorded vehicle, in any order; without tables, a vehicle uses the recorded ones.
         given: &'a [RecordedVehicle],
-        /// The recorded configuration.
+        /// The configuration of each vehicle as recorded, in the recording's order.
         recorded: &'a [RecordedVehicle],
     },
     /// The maps of this recording.
@@ -98,7 +98,7 @@ pub struct CellChange {
 /// One map of one layer, before and after.
 #[derive(Clone, Debug)]
 pub struct MapChange {
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub vehicle: String,
     /// Sequence of the map, after the change.
     pub sequence: u64,
@@ -128,13 +128,13 @@ pub enum CompareError {
     /// A recorded map cannot be decoded.
     #[error("{}: a map of layer {layer} of vehicle {vehicle}: {source}", file.display())]
     Map {
-        /// The recording.
+        /// Path of the recording with the map.
         file: PathBuf,
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
-        /// The layer's name.
+        /// Name of the map's layer.
         layer: String,
-        /// The fault.
+        /// Why the map cannot be decoded.
         source: Box<MapError>,
     },
     /// A recording has no maps to compare with another recording's maps.
@@ -142,7 +142,7 @@ pub enum CompareError {
         "{} has no maps (recorder.maps = {:?}): `clearway replay` makes them with --record", file.display(), maps.as_str()
     )]
     NoMaps {
-        /// The recording.
+        /// Path of the recording without maps.
         file: PathBuf,
         /// What it holds of them.
         maps: RecordedMaps,
@@ -152,7 +152,7 @@ pub enum CompareError {
         "the configuration does not fit {}: {what} {given}; recorded, in this order: {recorded}", file.display()
     )]
     Misfit {
-        /// The recording.
+        /// Path of the recording that the configuration does not fit.
         file: PathBuf,
         /// What does not fit.
         what: String,

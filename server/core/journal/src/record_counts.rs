@@ -28,7 +28,7 @@ struct Missing {
 }
 
 impl RecordCounts {
-    /// Counts a record.
+    /// Counts a message, an attachment or a metadata record, and remembers the summary's counts.
     pub(super) fn add(&mut self, record: &Record<'_>) {
         match record {
             Record::Message { header, .. } => *self.messages.entry(header.channel_id).or_default() += 1,

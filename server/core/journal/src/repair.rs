@@ -54,7 +54,7 @@ pub enum RepairError {
     /// No message of the damaged file can be read.
     #[error("{}: no message can be read{}", file.display(), incomplete.as_ref().map_or(String::new(), |of| format!(": {of}")))]
     Nothing {
-        /// The damaged file.
+        /// Path of the damaged file.
         file: PathBuf,
         /// How it is incomplete.
         incomplete: Option<String>,
@@ -62,23 +62,23 @@ pub enum RepairError {
     /// The new file cannot be created or moved to its name.
     #[error("{}: {source}", file.display())]
     Create {
-        /// The new file.
+        /// Path of the new file.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The new file cannot be written.
     #[error("{}: {source}", file.display())]
     Write {
-        /// The new file.
+        /// Path of the new file.
         file: PathBuf,
-        /// The reason.
+        /// Error of the MCAP writer.
         source: McapError,
     },
     /// The new file does not hold what was written to it.
     #[error("{}: read again, it has {found} messages and not {written}", file.display())]
     Differs {
-        /// The new file.
+        /// Path of the new file.
         file: PathBuf,
         /// Number of messages that were written.
         written: u64,

@@ -67,7 +67,7 @@ pub struct Report {
     pub repaired: Vec<String>,
     /// Version of clearway that recorded the file, as its metadata states it; empty without one.
     pub made_by: String,
-    /// The first differences.
+    /// The first differences, in file order.
     pub differences: Vec<Difference>,
     /// Number of all differences.
     pub different: u64,
