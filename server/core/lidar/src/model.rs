@@ -13,21 +13,21 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Model {
-    /// HDL-64E S1.
+    /// HDL-64E S1: 64 lasers.
     Hdl64eS1,
-    /// HDL-64E S2 (and S2.1).
+    /// HDL-64E S2 (and S2.1): 64 lasers.
     Hdl64eS2,
-    /// HDL-64E S3.
+    /// HDL-64E S3: 64 lasers.
     Hdl64eS3,
-    /// HDL-32E.
+    /// HDL-32E: 32 lasers.
     Hdl32e,
-    /// VLP-16 (Puck, Puck LITE).
+    /// VLP-16 (Puck, Puck LITE): 16 lasers.
     Vlp16,
-    /// Puck Hi-Res.
+    /// Puck Hi-Res: 16 lasers, closer together than in a VLP-16.
     PuckHiRes,
-    /// VLP-32C (Ultra Puck).
+    /// VLP-32C (Ultra Puck): 32 lasers.
     Vlp32c,
-    /// VLS-128 (Alpha Prime).
+    /// VLS-128 (Alpha Prime): 128 lasers.
     Vls128,
 }
 
@@ -65,7 +65,7 @@ pub const S1_FLAGS: [u16; 4] = [FLAG_LASERS_32, FLAG_LASERS_0, FLAG_LASERS_0, FL
 /// The properties of a model, from its manual.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModelSpec {
-    /// The model.
+    /// Model that these properties describe.
     pub model: Model,
     /// Name as Velodyne writes it.
     pub name: &'static str,
@@ -98,7 +98,7 @@ pub struct ModelSpec {
 }
 
 impl Model {
-    /// All models.
+    /// All models, in the order of the enum.
     pub const ALL: [Model; 8] = [
         Model::Hdl64eS1,
         Model::Hdl64eS2,

@@ -131,7 +131,7 @@ impl Cutter {
         self.last.is_some_and(|last| (1..=step_max(expected)).contains(&forward(last, self.cut)))
     }
 
-    /// Forgets the azimuth.
+    /// Forgets the newest azimuth and the counts travelled, as before the first firing.
     pub fn reset(&mut self) {
         (self.last, self.travelled) = (None, 0);
     }

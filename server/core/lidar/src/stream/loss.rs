@@ -30,7 +30,7 @@ pub(super) struct Loss {
     lost: u64,
     /// A long gap that is loss unless the next revolution repeats it.
     candidate: Option<EmptySector>,
-    /// The field-of-view gap.
+    /// The sector in which the sensor sends no packets in any revolution, if it has one.
     fov_gap: Option<EmptySector>,
     /// Azimuth at which the packet before ended.
     before: Option<u32>,
