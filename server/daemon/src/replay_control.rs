@@ -25,7 +25,7 @@ pub enum ControlError {
         to_microseconds(*at_s), to_microseconds(*from_s), to_microseconds(*to_s)
     )]
     Outside {
-        /// The field.
+        /// Field of the request with the time.
         what: &'static str,
         /// The requested time, in seconds after the first event.
         at_s: f64,
@@ -162,7 +162,7 @@ impl ReplayHandle {
         self.state.clone()
     }
 
-    /// Ends the replay.
+    /// Ends the replay before the end of its files.
     pub fn stop(&self) {
         // Fails if it has ended already.
         let _ = self.commands.send(Command::Stop);

@@ -63,17 +63,17 @@ impl Default for Connections {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Service {
-    /// gRPC.
+    /// The gRPC server.
     Grpc,
     /// The page and its WebSocket.
     Page,
     /// The listener of `/healthz`, `/readyz` and `/metrics` alone.
     Metrics,
-    /// Foxglove's WebSocket.
+    /// The WebSocket server for Foxglove.
     Foxglove,
-    /// zenoh.
+    /// The endpoint on which zenoh listens.
     Zenoh,
-    /// Datagrams.
+    /// The UDP socket for datagrams of sensors.
     Udp,
 }
 

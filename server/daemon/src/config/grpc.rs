@@ -12,7 +12,7 @@ use crate::base::file_advice::{advised, read_text};
 
 use super::error::{ConfigError, ValueError, beside};
 
-/// The table `[grpc]`.
+/// The table `[grpc]`: address, certificates and access rules of the gRPC server.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Grpc {

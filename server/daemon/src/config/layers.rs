@@ -28,7 +28,7 @@ pub(super) enum Node {
     List(Vec<Node>),
 }
 
-/// The root table.
+/// The root table, by key.
 #[derive(Clone, Debug)]
 pub(super) struct Layers(pub BTreeMap<String, Node>);
 

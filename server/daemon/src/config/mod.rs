@@ -56,7 +56,7 @@ pub const COMMENTED: &str = include_str!("../../../../deploy/clearway.toml");
 /// factory's table.
 pub type Calibrations = Vec<Vec<Option<Calibration>>>;
 
-/// The whole configuration.
+/// The whole configuration, as read from the file with its overrides.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -78,7 +78,7 @@ pub struct Config {
     /// What the peers of all TCP listeners may cost.
     #[serde(default)]
     pub connections: Connections,
-    /// The recording.
+    /// What is recorded, where to and for how long.
     #[serde(default)]
     pub recorder: Recorder,
     /// Where finished parts of the recording go.
@@ -92,7 +92,7 @@ pub struct Config {
     pub vehicles: Vec<Vehicle>,
 }
 
-/// The table `[page]`.
+/// The table `[page]`: the page, its WebSocket, `/healthz`, `/readyz` and `/metrics`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Page {

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
 
-/// The table `[recorder]`.
+/// The table `[recorder]`: what is recorded, where to and for how long.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Recorder {

@@ -52,7 +52,7 @@ pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
 
 /// One vehicle's engine before its thread runs.
 pub struct Engine {
-    /// The vehicle's core.
+    /// The core that makes the maps from the vehicle's events.
     pub pipeline: Pipeline,
     /// Age after the end of capture at which a map is stale, in milliseconds.
     pub valid_ms: u32,

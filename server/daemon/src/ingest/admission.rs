@@ -86,7 +86,7 @@ struct QueuedSample<S> {
 }
 
 impl<S> SourceQueue<S> {
-    /// An empty queue.
+    /// An empty queue that shares the bytes of `bytes` with the other sources.
     pub fn new(bytes: &QueueBytes) -> Self {
         Self {
             shared_bytes: bytes.shared.clone(),

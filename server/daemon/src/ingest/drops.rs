@@ -20,7 +20,7 @@ const UNKNOWN_SENDERS_MAX: usize = 8;
 #[derive(Debug, Default)]
 pub struct DropCounters {
     pub(super) unreported: Mutex<Unreported>,
-    /// The newest last.
+    /// Unknown senders, the newest last.
     unknown_senders: Mutex<VecDeque<UnknownSender>>,
     /// Refused messages by reason; the ledger counts all of them as `observation`, and no part of a message.
     refused_messages: Mutex<BTreeMap<&'static str, u64>>,

@@ -27,7 +27,7 @@ const AHEAD_NS_MAX: i64 = 10_000_000_000;
 /// The gateway of one vehicle.
 #[derive(Debug)]
 pub struct Gateway {
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub vehicle: Arc<str>,
     /// Limits of one observation.
     pub limits: Limits,

@@ -46,15 +46,15 @@ pub enum ObservationError {
     /// The bytes do not decode as an observation.
     #[error("not a clearway.v1.Observation: {reason}")]
     Message {
-        /// The decoder's reason.
+        /// Error of the protobuf decoder.
         reason: String,
     },
     /// The message is longer than any allowed scan.
     #[error("message of {bytes} bytes: up to {bytes_max} are allowed")]
     Length {
-        /// The message's length.
+        /// Length of the message, in bytes.
         bytes: usize,
-        /// [`Limits::message_bytes_max`].
+        /// Greatest length in bytes, [`Limits::message_bytes_max`].
         bytes_max: usize,
     },
     /// The observation has no body, or a body that this version does not know.
@@ -63,7 +63,7 @@ pub enum ObservationError {
     /// A packed list ends within a number.
     #[error("{list} of {bytes} bytes: a multiple of {number_bytes} bytes is allowed")]
     Part {
-        /// The list's field.
+        /// Field of the list, as in `clearway.v1.Observation`.
         list: &'static str,
         /// The list's length in bytes.
         bytes: usize,
@@ -77,7 +77,7 @@ pub enum ObservationError {
         what: &'static str,
         /// Number of elements.
         count: usize,
-        /// [`Limits::points_max`].
+        /// Greatest number, [`Limits::points_max`].
         points_max: usize,
     },
     /// The columns do not match the points of the scan.
@@ -123,7 +123,7 @@ pub enum ObservationError {
         stamp_ns: i64,
         /// Time by which it is ahead, ns.
         ahead_ns: i64,
-        /// [`Limits::ahead_ns_max`].
+        /// Greatest time ahead in ns, [`Limits::ahead_ns_max`].
         ahead_ns_max: i64,
     },
     /// A required field is missing.
@@ -131,7 +131,7 @@ pub enum ObservationError {
     Missing {
         /// `ego_pose`, `road`, `scan` or `declaration`.
         body: &'static str,
-        /// The missing field.
+        /// Name of the missing field.
         what: &'static str,
     },
 }

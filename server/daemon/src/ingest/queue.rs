@@ -36,7 +36,7 @@ pub struct Reading {
     pub arrival_ns: i64,
     /// Index of the sensor in the vehicle's configuration.
     pub source: u16,
-    /// The content.
+    /// Content of the reading.
     pub body: Body,
 }
 
@@ -59,7 +59,7 @@ pub struct LiveReading {
     pub arrival: Arrival,
     /// Index of the sensor in the vehicle's configuration.
     pub source: u16,
-    /// The content.
+    /// Content of the event.
     pub body: Body,
     /// Delivers the outcome to the client that sent it.
     pub receipt: Option<Receipt>,
@@ -80,7 +80,7 @@ pub struct QueueClosedError;
 /// One event on the queue.
 #[derive(Debug)]
 pub struct QueuedEvent {
-    /// The event.
+    /// The event, as the pipeline gets it.
     pub event: Event,
     /// Delivers the outcome to the client that sent the event. A recording does not contain it.
     pub receipt: Option<Receipt>,

@@ -178,7 +178,7 @@ fn sensor_of_key<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Opti
 /// The remembered clients of one source, ordered from the longest silent to the most recent.
 #[derive(Default)]
 struct Clients {
-    /// The source.
+    /// Id of the zenoh session; `None` if the samples state none.
     of: Option<ZenohId>,
     all: Vec<Client>,
     /// The sessions of clients that have ended since they were last taken.

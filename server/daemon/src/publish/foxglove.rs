@@ -42,7 +42,7 @@ use clearway_journal::encode::EncodedMap;
 
 /// Pages from which Foxglove connects, beside the configured pages.
 pub const ORIGINS: &[&str] = &["https://app.foxglove.dev"];
-/// The protocol.
+/// Name of the WebSocket subprotocol.
 const PROTOCOL: &str = "foxglove.sdk.v1";
 /// Longest time to send a message. Ours: a client this late shows stale maps anyway.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
@@ -99,7 +99,7 @@ struct Message {
     data: Bytes,
 }
 
-/// One channel.
+/// One channel of the server, for all clients.
 struct Channel {
     id: u64,
     topic: String,

@@ -62,7 +62,7 @@ pub(super) struct Node<'a> {
 }
 
 impl<'a> Node<'a> {
-    /// Declares the node.
+    /// Declares the liveliness token of the node, by which ROS 2 finds it.
     pub async fn declare(session: &'a Session, options: &'a Ros2) -> Result<Self, ZenohError> {
         let mut node = Self { session, options, tokens: Vec::new() };
         node.declare_token(&format!("0/NN/%/%/{NODE}")).await?;

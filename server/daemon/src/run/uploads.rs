@@ -31,7 +31,7 @@ type Seen = (PathBuf, u64, SystemTime);
 enum Problem {
     /// A part or the configuration: the reason.
     Part(String),
-    /// The store: the reason.
+    /// The store refuses or does not answer: the reason.
     Store(String),
 }
 

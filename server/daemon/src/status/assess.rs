@@ -26,7 +26,7 @@ const CLAIM_AGE_MAX: Duration = Duration::from_secs(4);
 /// What an assessment has found.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Assessment {
-    /// The state.
+    /// State of the vehicle's maps.
     pub state: State,
     /// Time for which the state has lasted.
     pub state_for: Duration,

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 pub enum Transport {
     /// A stream of `MapService.Watch`.
     Grpc,
-    /// An open page.
+    /// A browser that has the page open.
     Page,
     /// A key of zenoh with a subscriber.
     Zenoh,

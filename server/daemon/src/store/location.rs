@@ -21,7 +21,7 @@ const RETRY_TIMEOUT: Duration = Duration::from_secs(5);
 pub struct OpenError {
     /// The path or URL of the store.
     pub url: String,
-    /// The reason.
+    /// Why the store cannot be opened.
     pub reason: String,
 }
 

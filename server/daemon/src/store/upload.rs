@@ -41,9 +41,9 @@ pub enum UploadError {
     /// The part cannot be read.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// The part is not a recording.
@@ -52,15 +52,15 @@ pub enum UploadError {
     /// The part has no event and no map.
     #[error("{}: a recording without an event or a map", file.display())]
     Nothing {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
     },
     /// The store refused the part or did not answer.
     #[error("{}: {}", file.display(), reason(source))]
     Store {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
-        /// The store's reason.
+        /// Error of the store.
         source: object_store::Error,
     },
     /// The store has other bytes than it was sent.
@@ -69,7 +69,7 @@ pub enum UploadError {
         file.display()
     )]
     Differs {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
         /// The name of the object.
         part: String,

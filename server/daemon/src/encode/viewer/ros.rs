@@ -30,13 +30,13 @@ const NARROW: f64 = 50.0;
 
 /// A layer of a map, as its topics show it.
 pub struct ShownLayer<'a> {
-    /// The map.
+    /// The map that has the layer.
     pub map: &'a MapView,
-    /// Its layer.
+    /// The layer to show.
     pub layer: &'a Layer,
     /// The raster of the layer.
     pub raster: &'a Raster,
-    /// The vehicle's frames.
+    /// Names of the frames in the messages.
     pub frames: &'a FrameNames,
     /// True until the map is stale.
     pub is_fresh: bool,

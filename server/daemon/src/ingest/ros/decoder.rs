@@ -45,9 +45,9 @@ pub enum RosMessageError {
     /// The topic's role does not allow this type.
     #[error("a {kind}: allowed: {allowed}")]
     Kind {
-        /// The message's type.
+        /// Type of the refused message.
         kind: Kind,
-        /// The allowed types.
+        /// The types that the topic's role allows, in words.
         allowed: &'static str,
     },
     /// A cloud is in another frame than the first clouds of its topic.
@@ -69,9 +69,9 @@ pub enum RosMessageError {
     /// No chain of transforms joins the message's frame and the vehicle's.
     #[error("frame {frame}: no chain of transforms joins it to {ego_frame}")]
     Frame {
-        /// The message's frame.
+        /// Frame that the message names.
         frame: String,
-        /// The vehicle's frame.
+        /// Name of the vehicle's frame.
         ego_frame: String,
     },
 }

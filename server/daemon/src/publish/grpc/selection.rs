@@ -17,7 +17,7 @@ use clearway_journal::encode::EncodedMap;
 /// Greatest `max_in_flight`. Ours: more maps on the way would only be older ones.
 const IN_FLIGHT_MAX: u32 = 64;
 
-/// A checked selection.
+/// A reader's selection of maps, checked against the vehicle.
 #[derive(Clone, Debug)]
 pub struct Selection {
     /// The layers to send; all if empty.

@@ -268,7 +268,7 @@ impl ConnectionSlot {
         self.slots.count(reason);
     }
 
-    /// Closes the connection.
+    /// Logs and counts the end of the connection under `reason`, and closes it.
     pub fn close(&self, reason: &'static str) {
         tracing::info!(peer = %self.peer, reason, "connection closed");
         self.count(reason);

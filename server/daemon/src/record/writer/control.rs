@@ -11,12 +11,12 @@ use super::counts::RecorderCounts;
 use super::folder::Folder;
 use crate::config::Recorder as Options;
 
-/// A request.
+/// A request of an operator to the recorder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// Records again.
+    /// Records again after [`Command::Stop`].
     Start,
-    /// Closes the file.
+    /// Closes the file; nothing is recorded until [`Command::Start`].
     Stop,
     /// Begins the next part.
     Split,

@@ -28,17 +28,17 @@ pub enum RecordError {
     /// The file or the recorder's thread cannot be created.
     #[error("recording {}: {source}", file.display())]
     Create {
-        /// The recording.
+        /// Path of the recording.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// The header cannot be written.
     #[error("recording {}: {}", file.display(), with_cause(source))]
     Write {
-        /// The recording.
+        /// Path of the recording.
         file: PathBuf,
-        /// The reason.
+        /// Error of the MCAP writer.
         source: McapError,
     },
 }

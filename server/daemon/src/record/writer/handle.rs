@@ -34,7 +34,7 @@ const AFTER_LOSS_NS: u64 = 1_000_000_000;
 
 /// One element of the recorder's queue.
 pub(super) enum Item {
-    /// An event.
+    /// An event of the vehicle with this index.
     Event(usize, Event),
     /// A map, and the hop that ends when it is written.
     Map(usize, Arc<EncodedMap>, Hop),

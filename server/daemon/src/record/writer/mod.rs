@@ -49,7 +49,7 @@ const FINISH_TIME_MAX: Duration = Duration::from_secs(5);
 /// Interval at which the end of the recorder's thread is looked for.
 const FINISH_POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-/// The running recorder.
+/// The recorder of a running server, with its thread.
 #[derive(Debug)]
 pub struct Recorder {
     control: RecorderControl,

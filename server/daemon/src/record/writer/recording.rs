@@ -149,7 +149,7 @@ impl<F: Files> RecordingWriter<F> {
         is_item
     }
 
-    /// Ends the recording.
+    /// Writes the items that are still queued and closes the file.
     pub fn finish(mut self) {
         while let Ok(item) = self.items.try_recv() {
             self.write(item, Instant::now());

@@ -49,7 +49,7 @@ impl State {
         }
     }
 
-    /// All states.
+    /// All states, from the best to the worst.
     pub const ALL: [Self; 3] = [Self::Ok, Self::Warn, Self::Error];
 }
 
@@ -76,7 +76,7 @@ pub struct Facts {
     pub replay: Option<(ReplayPhase, Duration)>,
     /// What the replay waits for in lockstep; empty: nothing.
     pub replay_awaited: String,
-    /// The sensors.
+    /// Facts of each of the vehicle's sensors.
     pub sensors: Vec<SensorFacts>,
     /// The addresses that sent datagrams in the last seconds and are none of the vehicle's sensors.
     pub unknown_senders: Vec<String>,
@@ -170,7 +170,7 @@ impl Health {
         self.state != before
     }
 
-    /// The state.
+    /// State of the newest assessment.
     pub fn state(&self) -> State {
         self.state
     }
