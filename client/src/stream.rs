@@ -19,7 +19,7 @@ const AFTER_END: Duration = Duration::from_secs(2);
 /// One map from a stream.
 #[derive(Clone, Debug)]
 pub struct Update {
-    /// The newest map.
+    /// The newest map that the stream received.
     pub map: MapView,
     /// Number of maps made since the update before that this reader did not get, because it or its link was slow.
     pub skipped: u64,

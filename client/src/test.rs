@@ -41,9 +41,9 @@ pub enum ReplayError {
     /// The command cannot be run.
     #[error("run {command:?}: {source}; install clearway, or name its command in the environment variable CLEARWAY")]
     Command {
-        /// The command.
+        /// Path or name of the command that was tried.
         command: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The server ended before readers could connect.
@@ -60,7 +60,7 @@ pub enum ReplayError {
     File {
         /// The folder or file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
 }

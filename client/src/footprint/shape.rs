@@ -23,13 +23,13 @@ pub enum ShapeError {
     NotFinite {
         /// The value's name, such as `corner 2, y`.
         what: String,
-        /// The value.
+        /// The value that is NaN or infinite.
         value: f64,
     },
     /// A length is negative, or a path is too long.
     #[error("{what} is {value} m; {allowed} m is allowed")]
     Length {
-        /// The value's name.
+        /// Name of the value, such as `front_m`.
         what: &'static str,
         /// The value, in metres.
         value: f64,
@@ -43,7 +43,7 @@ pub enum ShapeError {
         what: &'static str,
         /// Number of different places.
         number: usize,
-        /// Least number.
+        /// Least number of different places that is needed.
         least: usize,
     },
     /// Two edges of a polygon cross.
@@ -143,7 +143,7 @@ pub struct Outline {
     pub front_m: f64,
     /// Distance from the reference point to the rear.
     pub rear_m: f64,
-    /// Width.
+    /// Width of the outline; half of it lies on each side of the reference point.
     pub width_m: f64,
 }
 
