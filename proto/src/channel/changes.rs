@@ -137,7 +137,7 @@ struct Run {
 /// Collects the pieces of a payload in the order in which a decoder needs them. A run grows after it was started.
 struct RunWriter {
     tokens: Vec<Token>,
-    /// By context.
+    /// The newest run of each context, by index of the context.
     newest: [Run; CONTEXTS],
 }
 

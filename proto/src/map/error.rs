@@ -14,7 +14,7 @@ pub enum MapError {
     TooLong {
         /// Bytes of the encoded map.
         length: usize,
-        /// [`crate::limits::Limits::map_bytes`].
+        /// Greatest length in bytes, [`crate::limits::Limits::map_bytes`].
         allowed: usize,
     },
     /// The map has more layers, channels, planes, sensors and names than the reader accepts.
@@ -22,7 +22,7 @@ pub enum MapError {
     TooManyParts {
         /// Number that the map claims.
         parts: usize,
-        /// [`crate::limits::Limits::map_parts`].
+        /// Greatest number of parts, [`crate::limits::Limits::map_parts`].
         allowed: usize,
     },
     /// The bytes are not a protobuf `clearway.v1.Map`.
@@ -37,9 +37,9 @@ pub enum MapError {
     /// The map has a later major version of the wire.
     #[error("wire of version {version}; this reader knows versions up to {known}")]
     Version {
-        /// `Header.wire_version`.
+        /// The version in `Header.wire_version`.
         version: u32,
-        /// [`crate::limits::WIRE_VERSION`].
+        /// The newest version that this reader knows, [`crate::limits::WIRE_VERSION`].
         known: u32,
     },
     /// Two layers, or two channels of a layer, have one name.
@@ -47,7 +47,7 @@ pub enum MapError {
     Twice {
         /// `layer` or `channel`.
         what: &'static str,
-        /// The name.
+        /// The name that occurs twice.
         name: String,
     },
     /// A grid is absent or impossible.
@@ -63,7 +63,7 @@ pub enum MapError {
     TooManyCells {
         /// Number that the channels claim.
         cells: u64,
-        /// [`crate::limits::Limits::map_cells`].
+        /// Greatest number of cells, [`crate::limits::Limits::map_cells`].
         allowed: u64,
     },
     /// A channel has another number of cells than its grid.
@@ -73,7 +73,7 @@ pub enum MapError {
         layer: String,
         /// Name of the channel.
         channel: String,
-        /// `Channel.cell_count`.
+        /// Number of cells in `Channel.cell_count`.
         cell_count: u32,
         /// Cells of the grid.
         expected: u64,
@@ -101,7 +101,7 @@ pub enum MapError {
     OtherBase {
         /// Name of the layer.
         layer: String,
-        /// The base map.
+        /// The map that the delta needs as its base.
         needed: Box<MapId>,
         /// The map that was given.
         given: Box<MapId>,
