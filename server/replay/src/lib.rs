@@ -66,7 +66,7 @@ pub struct ReplayProgress {
 
 /// A replay whose server runs, before its first event.
 pub struct ReplayRun {
-    /// The server.
+    /// The server that publishes the replayed maps.
     pub running: Running,
     /// How far the files are read.
     pub progress: ReplayProgress,
@@ -150,7 +150,7 @@ impl ReplayRun {
         &self.summary.mount
     }
 
-    /// Controls the replay.
+    /// Returns a handle that pauses, seeks and stops the replay.
     pub fn handle(&self) -> ReplayHandle {
         self.handle.clone()
     }

@@ -13,11 +13,11 @@ use crate::files::{Kind, Readings};
 
 /// A recording of this server.
 pub(super) struct Recorded {
-    /// The file.
+    /// Path of the recording.
     pub file: PathBuf,
-    /// Its configuration.
+    /// The recorded configuration.
     pub config: Config,
-    /// Its calibration tables.
+    /// The recorded calibration tables, by vehicle and sensor.
     pub tables: Calibrations,
     /// Boot id of its maps.
     pub boot_id: u64,

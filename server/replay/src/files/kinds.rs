@@ -28,7 +28,7 @@ pub enum FilesError {
     Open {
         /// The file or folder.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The kind of a file is unknown.
@@ -40,7 +40,7 @@ pub enum FilesError {
     /// A file can be read after it is converted.
     #[error("{}: {what}: {advice}", file.display())]
     Converted {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
         /// What it is.
         what: &'static str,
@@ -62,7 +62,7 @@ pub enum FilesError {
         file.display()
     )]
     Overlap {
-        /// The later file.
+        /// Path of the later file.
         file: PathBuf,
         /// By how much, in seconds.
         overlap_s: f64,
@@ -81,7 +81,7 @@ pub enum FilesError {
 /// A file that is truncated or damaged; the readings of its whole parts were used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Truncated {
-    /// The file.
+    /// Path of the file.
     pub file: PathBuf,
     /// How the file is incomplete.
     pub reason: String,

@@ -21,17 +21,17 @@ pub enum ScanError {
     /// The file cannot be read.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The file has no valid scan.
     #[error("{}: {source}", file.display())]
     Scan {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// The fault.
+        /// Why the file has no valid scan.
         source: Box<ScanFileError>,
     },
 }

@@ -72,7 +72,7 @@ struct AwaitedMap {
     since: Instant,
 }
 
-/// A replay.
+/// Plays the readings of all vehicles through their engines, at the rate of the clock.
 pub struct Player {
     timeline: Timeline,
     vehicles: Vec<ReplayedVehicle>,

@@ -20,7 +20,7 @@ const AHEAD: usize = 1024;
 /// The files of one vehicle, in the order of their times.
 #[derive(Clone, Debug)]
 pub struct Track {
-    /// The files.
+    /// Paths of the files, in the order of their times.
     pub files: Vec<PathBuf>,
     /// What is read of them.
     pub options: McapOptions,
@@ -44,7 +44,7 @@ pub struct TimedReading {
     pub vehicle: usize,
     /// Recorded time: the reading's arrival, without a step of the clock that is a fault.
     pub at_ns: i64,
-    /// The reading.
+    /// The reading that arrives at this time.
     pub reading: Reading,
     /// Messages of this vehicle that were refused before it became readings.
     pub refused: RefusedMessages,
@@ -53,7 +53,7 @@ pub struct TimedReading {
 /// What a timeline has beside its readings; known at its end.
 #[derive(Debug, Default)]
 pub struct Remarks {
-    /// The truncated files.
+    /// Files that are truncated or damaged.
     pub truncated: Vec<Truncated>,
     /// Topics and packets that were ignored or refused, for people.
     pub notes: Vec<String>,

@@ -28,9 +28,9 @@ pub enum ChoiceError {
     /// The file does not have a requested topic.
     #[error("{}: --topic {topic}: the file has: {known}", file.display())]
     Topic {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// The requested topic.
+        /// The topic that `--topic` names.
         topic: String,
         /// The topics of the file, with their types.
         known: String,
@@ -40,7 +40,7 @@ pub enum ChoiceError {
 /// The topic of a sensor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SensorTopic {
-    /// The topic.
+    /// Name of the topic.
     pub topic: String,
     /// The frame of its messages.
     pub frame_id: String,
@@ -57,14 +57,14 @@ pub struct SensorTopic {
     pub is_merged: bool,
 }
 
-/// The chosen topics.
+/// The topics of a file from which a replay makes maps.
 #[derive(Clone, Debug)]
 pub struct TopicChoice {
     /// The topics of the sensors, by index of the sensor.
     pub sensors: Vec<SensorTopic>,
     /// The source of the ego poses.
     pub pose: Option<PoseSource>,
-    /// The vehicle's frame.
+    /// Name of the vehicle's frame.
     pub ego_frame: String,
     /// The frame of the poses; empty if there are none, or if they name none.
     pub fixed_frame: String,
