@@ -41,7 +41,7 @@ pub struct SendOptions {
     pub telemetry_to: SocketAddr,
     /// Address to send from.
     pub own: SocketAddr,
-    /// Speed.
+    /// How fast the datagrams are sent.
     pub pace: Pace,
     /// True: the file is sent again and again.
     pub repeats: bool,

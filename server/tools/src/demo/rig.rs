@@ -111,7 +111,7 @@ impl Rig {
         SimulatedVehicle::starting_at(self.scene.clone(), self.scanners[index].1.clone(), self.start_ns)
     }
 
-    /// The car's observations.
+    /// The car's poses, roads and scans, each with its period.
     pub fn observations(&self) -> Observations<'_> {
         let mut due = vec![(POSE_PERIOD_NS, ObservationKind::Pose)];
         due.extend(self.units.first().map(|_| (ROAD_PERIOD_NS, ObservationKind::Road)));

@@ -52,7 +52,7 @@ pub struct DemoOptions {
     pub black_box: bool,
     /// The file that the newest map is drawn to every second; `None`: nothing is drawn.
     pub picture: Option<PathBuf>,
-    /// The car's sensors.
+    /// The sensors with which the car drives.
     pub sensors: DemoSensors,
     /// Number of vehicles; one of several fails after a minute and comes back. 0 is 1.
     pub vehicles: usize,
@@ -67,7 +67,7 @@ pub struct DemoEndpoints {
     pub page: SocketAddr,
     /// The address of gRPC.
     pub grpc: SocketAddr,
-    /// zenoh's endpoints.
+    /// The endpoints on which zenoh listens.
     pub zenoh: Vec<String>,
     /// The sensors, and why they were chosen.
     pub sensors: String,

@@ -32,7 +32,7 @@ pub enum DemoSensors {
 /// The sensor on the roof that was chosen, and why.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SensorChoice {
-    /// The model.
+    /// The chosen model.
     pub model: Model,
     /// Share of one core that simulating it takes, as measured for each model that was tried, the chosen one last.
     /// Empty if the model was given.

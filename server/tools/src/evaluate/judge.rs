@@ -41,7 +41,7 @@ pub enum Vote {
     Either,
     /// Ground that a vehicle can reach and drive on.
     Drivable,
-    /// An obstacle.
+    /// An obstacle, on which a vehicle cannot drive.
     Obstacle,
 }
 

@@ -149,7 +149,7 @@ pub struct EvaluatedWorld {
     pub name: String,
     /// What was drawn.
     pub description: String,
-    /// Its counts.
+    /// Counts of the world's cells and points.
     pub row: EvaluatedRow,
 }
 

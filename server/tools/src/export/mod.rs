@@ -31,7 +31,7 @@ mod viewer_file;
 /// What is exported, and where to.
 #[derive(Clone, Debug)]
 pub struct ExportOptions {
-    /// The recording (MCAP).
+    /// Path of the recording, an MCAP file.
     pub recording: PathBuf,
     /// Names of the layers; all if empty.
     pub layers: Vec<String>,

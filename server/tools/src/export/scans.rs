@@ -26,7 +26,7 @@ pub struct DecodedScan<'a> {
     pub stamp_ns: i64,
     /// Position and orientation of the sensor in the ego frame.
     pub ego_from_sensor: &'a Isometry3<f64>,
-    /// Its points.
+    /// The points in the sensor frame.
     pub points: ScanPoints,
 }
 

@@ -8,7 +8,7 @@ pub const LETTER: usize = 8;
 /// Dots of a character that the font does not have: a filled box.
 const BOX: [u8; LETTER] = [0xff; LETTER];
 
-/// A picture.
+/// A picture of pixels in memory, which can be encoded as a PNG.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
     /// Width, in pixels.

@@ -34,7 +34,7 @@ pub struct CutObject {
     height_m: f32,
 }
 
-/// The objects.
+/// The objects that are put into scans.
 pub const OBJECTS: [CutObject; 6] = [
     CutObject { name: "box of 0.5 m", size_m: [0.5, 0.5], height_m: 0.5 },
     CutObject { name: "log of 0.2 m", size_m: [0.3, 2.0], height_m: 0.2 },

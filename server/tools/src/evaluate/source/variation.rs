@@ -34,7 +34,7 @@ pub enum Variation {
     SensorOffset(f64),
 }
 
-/// A varied scan.
+/// A scan after a [`Variation`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Varied {
     /// The scan, sensor frame.
