@@ -36,7 +36,7 @@ pub struct Datagram {
     pub stamp_ns: i64,
     /// Data packet or telemetry.
     pub kind: Kind,
-    /// UDP payload.
+    /// Payload of the UDP datagram, without headers.
     pub payload: Vec<u8>,
 }
 
@@ -96,7 +96,7 @@ impl SimulatedVehicle {
         &self.scene
     }
 
-    /// The vehicle's sensor.
+    /// The LIDAR on the vehicle.
     pub fn scanner(&self) -> &Scanner {
         &self.scanner
     }

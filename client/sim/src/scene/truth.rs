@@ -12,7 +12,7 @@ use super::world::World;
 /// Class of a place, for a vehicle that stands in the middle of the raster.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Truth {
-    /// Beyond the raster.
+    /// A place beyond the raster; nothing is known of it.
     #[default]
     Outside,
     /// Free ground that the vehicle reaches through passages that are wide enough.

@@ -32,7 +32,7 @@ use super::scenes::Scene;
 use super::world::World;
 use draw::Draw;
 
-/// A random world.
+/// A world made from a seed: a theme on a form, with objects.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RandomWorld {
     /// Seed of the world.

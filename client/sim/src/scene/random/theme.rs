@@ -42,7 +42,7 @@ pub enum Theme {
 }
 
 impl Theme {
-    /// All themes.
+    /// All themes, in the order of the enum.
     pub const ALL: [Self; 13] = [
         Self::Kerbs,
         Self::Ditch,
