@@ -217,7 +217,7 @@ async fn send_poses(client: Client, vehicle: String) {
     }
 }
 
-/// The server's process.
+/// A process of the server under test, with its addresses.
 struct Process {
     child: Child,
     grpc: String,

@@ -40,7 +40,7 @@ pub enum Habit {
     Fickle,
 }
 
-/// One reader.
+/// A simulated reader with its habit and its layers.
 pub struct SimulatedReader {
     habit: Habit,
     layers: Vec<String>,

@@ -17,7 +17,7 @@ use super::fault_plan::DiskFault;
 /// One file on the disk in memory.
 #[derive(Clone, Debug, Default)]
 pub struct MemoryFile {
-    /// Everything written.
+    /// All bytes that were written.
     pub bytes: Vec<u8>,
     /// Number of bytes that survive a power cut for certain.
     pub synced: usize,

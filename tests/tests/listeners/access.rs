@@ -61,7 +61,7 @@ const CALLERS: [Caller; 8] = [
 /// What a client attempts.
 #[derive(Clone, Debug)]
 enum Attempt {
-    /// Calls an RPC.
+    /// Calls the RPC with this path.
     Rpc(&'static str),
     /// Receives a sample of a key over zenoh.
     Subscribe(&'static str),
