@@ -27,7 +27,7 @@ mod computing;
 pub enum After<'a> {
     /// Maps computed from the recorded events with another configuration.
     Config {
-        /// The configuration of each recorded vehicle, in any order; without tables, a vehicle uses the recorded ones.
+        /// Configuration of each recorded vehicle, in any order; without tables, a vehicle uses the recorded tables.
         given: &'a [RecordedVehicle],
         /// The configuration of each vehicle as recorded, in the recording's order.
         recorded: &'a [RecordedVehicle],
@@ -74,7 +74,7 @@ pub struct LayerChange {
     pub gained_m2: f64,
     /// Area that was free and is no more, in square metres, in all maps.
     pub lost_m2: f64,
-    /// Number of cells by class before and class after; only those that changed.
+    /// Number of changed cells, by class before and class after.
     pub classes: BTreeMap<(String, String), u64>,
     /// The first cell whose class changed.
     pub first: Option<CellChange>,
@@ -359,7 +359,7 @@ impl Pairs {
         let map = OneLayer { sequence, stamp_ns, layer: decoded };
         let key = (vehicle, layer);
         let waiting = self.waiting.entry(key.clone()).or_default();
-        // The other side's maps that wait here are at least as new as this one.
+        // The other side's maps that wait here are at least as new as this map.
         match waiting[other].pop_front_if(|counterpart| counterpart.stamp_ns == stamp_ns) {
             None => waiting[side].push_back(map),
             Some(counterpart) => {

@@ -224,7 +224,7 @@ impl McapReader {
         self.records.lost().iter().filter(|part| part.is_loss).count()
     }
 
-    /// What `clearway repair` could not read of the damaged file, if it wrote this one: the losses so far, in file
+    /// What `clearway repair` could not read of the damaged file, if it wrote this file: the losses so far, in file
     /// order. The file itself is whole.
     pub fn repaired(&self) -> &[String] {
         &self.repaired

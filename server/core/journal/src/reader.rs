@@ -195,12 +195,12 @@ impl RecordingReader {
         self.reader.damages()
     }
 
-    /// What a repair could not read of the damaged file, if this one is repaired: the losses so far.
+    /// What a repair could not read of the damaged file, if this file is repaired: the losses so far.
     pub fn repaired(&self) -> &[String] {
         self.reader.repaired()
     }
 
-    /// Number of lost parts so far, of this file and of the one from which it was repaired.
+    /// Number of lost parts so far, of this file and of the file from which it was repaired.
     pub fn loss_count(&self) -> usize {
         self.reader.loss_count() + self.repaired().len()
     }

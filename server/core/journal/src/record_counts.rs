@@ -8,7 +8,7 @@ use mcap::records::{Record, Statistics};
 
 use crate::counted::counted;
 
-/// The numbers of records that were read, and those that the file states.
+/// The numbers of records that were read, and the numbers that the file states.
 #[derive(Default)]
 pub(super) struct RecordCounts {
     messages: BTreeMap<u16, u64>,
@@ -39,7 +39,7 @@ impl RecordCounts {
         }
     }
 
-    /// Adds counts of the recorder; only the last ones, of the closed file, are complete.
+    /// Adds counts of the recorder; only the last counts, of the closed file, are complete.
     pub(super) fn add_recorder(&mut self, counts: v1::RecordingCounts) {
         self.recorder = Some(counts).filter(|counts| counts.closed);
     }
@@ -105,7 +105,7 @@ impl RecordCounts {
         has_others && self.missing_messages(topic) == Some(0)
     }
 
-    /// What is wrong with the numbers of messages, if the damaged parts of the file name this many lost ones.
+    /// What is wrong with the numbers of messages, if the damaged parts of the file name this many lost messages.
     pub(super) fn faults(&self, named: u64, topic: impl Fn(u16) -> String) -> Vec<String> {
         let differing = self.differing(topic).unwrap_or_default();
         let more = differing.iter().filter(|of| of.read > of.stated);

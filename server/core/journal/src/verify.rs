@@ -29,7 +29,7 @@ mod difference;
 use difference::first_difference;
 pub use difference::{Difference, DifferenceKind};
 
-/// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
+/// Greatest number of differences in a report; all are counted. Ours: the first differences explain the others.
 const DIFFERENCES_MAX: usize = 20;
 
 /// The result of a verification.
@@ -62,7 +62,7 @@ pub struct Report {
     pub damages: Vec<Damage>,
     /// How the file is incomplete; `None` if it is whole.
     pub incomplete: Option<String>,
-    /// What `clearway repair` could not read of the damaged file, if it wrote this one. The events and maps that are
+    /// What `clearway repair` could not read of the damaged file, if it wrote this file. The events and maps that are
     /// lost there are no differences.
     pub repaired: Vec<String>,
     /// Version of clearway that recorded the file, as its metadata states it; empty without one.
@@ -127,7 +127,7 @@ struct VehicleReplay {
     records: RecordedMaps,
     /// Sequence of the next event; `None` before the first one.
     next_event: Option<u64>,
-    /// True if events are missing before this one, until the next keyframe; the maps need not equal the computed ones.
+    /// True if events are missing, until the next keyframe; the recorded maps need not equal the computed maps.
     lacks_events: bool,
     /// Computed maps that are not compared yet, by sequence and layer.
     computed: BTreeMap<(u64, String), Bytes>,
@@ -220,7 +220,7 @@ pub fn verify(mut recording: RecordingReader, vehicles: Vec<RecordedVehicle>) ->
         report.incomplete.get_or_insert(differs);
     }
     let mut has_changed = recording.lacks_messages() || recording.loss_count() > 0;
-    // After a gap the maps that are computed have other numbers than the recorded ones.
+    // After a gap the maps that are computed have other numbers than the recorded maps.
     let is_early = |replay: &VehicleReplay| replay.extra.iter().any(|map| replay.computed.contains_key(map));
     if !has_changed && replays.iter().any(is_early) {
         has_changed = true;
