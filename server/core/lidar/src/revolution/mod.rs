@@ -60,8 +60,8 @@ pub struct Revolution {
     pub partial: Option<Partial>,
     /// Number of data packets with firings in this revolution.
     pub packets: u32,
-    /// Number of data packets that the revolution should have: `packets` and those that were missing, ±1 per gap. From
-    /// the second revolution on, packets of a field-of-view gap are not counted. A gap over the cut is counted in the
+    /// Number of data packets that the revolution should have: `packets` and the missing packets, ±1 per gap. From the
+    /// second revolution on, packets of a field-of-view gap are not counted. A gap over the cut is counted in the
     /// revolution in which it begins.
     pub packets_expected: u32,
     /// Encoder angles, as [`Firing::azimuth_rad`], between which the sensor does not fire because a field of view is

@@ -238,9 +238,9 @@ impl Decoder {
         self.status.device_time_stands
     }
 
-    /// Counts from the packet before to this one: the step of a sensor whose packets have a single firing (VLS-128 in
-    /// dual-return mode). It is the nominal step if the measured one differs by more than half of it: then a packet was
-    /// lost, or the rate of rotation is not known yet.
+    /// Counts from the packet before to this packet: the step of a sensor whose packets have a single firing (VLS-128
+    /// in dual-return mode). It is the nominal step if the measured step differs by more than half of it: then a packet
+    /// was lost, or the rate of rotation is not known yet.
     fn step_between_packets(&mut self, packet: &Packet<'_>) -> Option<u32> {
         let azimuth = packet.azimuth(0);
         let before = self.packet_azimuth.replace(azimuth);

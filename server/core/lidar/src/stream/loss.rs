@@ -9,7 +9,7 @@ use super::order::Gap;
 use crate::model::AZIMUTHS_PER_REVOLUTION;
 
 /// Least length of a field-of-view gap, in counts: 15 degrees. Ours: three packets of a VLP-16, the sensor with the
-/// longest ones; a shorter gap is loss.
+/// longest packets; a shorter gap is loss.
 const FOV_GAP_MIN: u32 = 1_500;
 /// Number of packets by which the ends of a field-of-view gap may differ between revolutions: the gap ends between two
 /// packets, so each end moves by one packet, and a loss beside it moves the end by another.

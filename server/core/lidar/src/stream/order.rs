@@ -107,7 +107,7 @@ struct Newest {
 pub(crate) struct Order {
     /// Waiting packets, by position.
     waiting: VecDeque<Waiting>,
-    /// Memory of packets that no longer wait, for the next ones.
+    /// Memory of packets that no longer wait, for the next packets.
     spare: Vec<Waiting>,
     newest: Option<Newest>,
     /// Position and length of the last packet that passed.

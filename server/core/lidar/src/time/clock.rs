@@ -289,7 +289,7 @@ impl DeviceClock {
         begins
     }
 
-    /// True if the newest epoch is old enough for another one to begin at `first_ns` on the timeline.
+    /// True if the newest epoch is old enough for another epoch to begin at `first_ns` on the timeline.
     fn may_begin_epoch(&self, first_ns: i64) -> bool {
         self.epoch_began_ns.is_none_or(|began_ns| first_ns - began_ns >= EPOCH_NS_MIN)
     }
