@@ -10,7 +10,7 @@ use super::error::ValueError;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Connections {
-    /// Most connections at once, at each listener; further ones are refused with RESOURCE_EXHAUSTED or 503.
+    /// Most connections at once, at each listener; further connections are refused with RESOURCE_EXHAUSTED or 503.
     pub max: usize,
     /// Most connections of one address at once, at each listener. IPv6: of one network with a prefix of 64 bits.
     pub per_address_max: usize,

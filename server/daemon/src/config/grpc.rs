@@ -41,7 +41,7 @@ impl Default for Grpc {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tls {
-    /// The server's certificate, and the intermediate ones between it and the CA.
+    /// The server's certificate, and the intermediate certificates between it and the CA.
     pub certificate: PathBuf,
     /// Its private key. A recording holds the path only.
     pub key: PathBuf,

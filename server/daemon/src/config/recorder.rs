@@ -47,7 +47,7 @@ pub struct Recorder {
     /// True if a file that exists stays, and the recording gets the next free name; never configured, only by `serve`.
     #[serde(skip)]
     pub is_numbered: bool,
-    /// The configured file, if `file` is another name because that one is taken.
+    /// The configured file, if `file` is another name because the configured name is taken.
     #[serde(skip)]
     pub family: PathBuf,
 }

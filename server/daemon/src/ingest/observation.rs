@@ -2,7 +2,7 @@
 //!
 //! An observation is bytes of a client. All lengths are compared before any allocation, and an allocation is no longer
 //! than the message. The core checks the rest (stamps, poses, roads, lists of different lengths), so that the journal
-//! contains those refusals.
+//! contains its refusals.
 
 use bytes::Bytes;
 use clearway_mapping::event::Body;

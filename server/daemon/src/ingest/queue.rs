@@ -316,7 +316,7 @@ impl EventQueue {
         QueuePosition { next_sequence: state.next_sequence, reported_ns: state.reported_ns }
     }
 
-    /// Goes on as if the events so far were those before `position`: a replay jumps.
+    /// Goes on as if the events so far were the events before `position`: a replay jumps.
     pub fn set_position(&self, position: QueuePosition) {
         let mut state = locked(&self.state);
         (state.next_sequence, state.reported_ns) = (position.next_sequence, position.reported_ns);

@@ -27,7 +27,7 @@ pub fn run_config(recording: &RecordingReader) -> Result<(Config, Calibrations),
 }
 
 /// The configuration of the recorded run with some of its keys set to other values. A key that is a constant of this
-/// version is left out, and a warning names it if its recorded value is another one.
+/// version is left out, and a warning names it if its recorded value is another value.
 ///
 /// # Errors
 /// [`RecordingError::NoConfig`] if the recording has no configuration, [`RecordingError::Config`] if it is invalid.

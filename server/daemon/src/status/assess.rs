@@ -70,7 +70,7 @@ pub async fn state_changed(states: &mut [watch::Receiver<State>]) {
 }
 
 impl VehicleStatus {
-    /// The state of the vehicle as it changes, with the one of now.
+    /// The state of the vehicle as it changes, the present state first.
     pub fn states(&self) -> watch::Receiver<State> {
         self.health_state.subscribe()
     }

@@ -45,7 +45,7 @@ impl Window {
         }
     }
 
-    /// Adds the counts at `at`; those that follow another sample too soon are left out.
+    /// Adds the counts at `at`; counts that follow another sample too soon are left out.
     pub fn push_counts(&mut self, at: Duration, counts: PacketCounts) {
         if self.counts.back().is_some_and(|(last, _)| at.saturating_sub(*last) < SAMPLE_PERIOD) {
             return;

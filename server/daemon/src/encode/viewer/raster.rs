@@ -3,8 +3,8 @@
 //! In: a layer, Cartesian or radial. Out: row by row, x first, an occupancy (0 free to 100 occupied, -1 unknown) or
 //! red, green, blue and alpha for each cell; and the position of the cells in the ego frame. A Cartesian layer keeps
 //! its cells and its axes. A radial layer is resampled: a square cell gets the worst of the radial cell at its middle
-//! and those whose middles lie in it, so that near the vehicle, where radial cells are smaller, no obstacle is lost.
-//! Unknown is worse than free.
+//! and the radial cells whose middles lie in it, so that near the vehicle, where radial cells are smaller, no obstacle
+//! is lost. Unknown is worse than free.
 //!
 //! | occupancy | meaning of the class |
 //! |---|---|

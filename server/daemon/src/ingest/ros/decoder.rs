@@ -144,8 +144,8 @@ impl TopicDecoder {
         Self { cloud_frames, ..self }
     }
 
-    /// The decoder, which refuses poses of the topic of poses in another frame than this one; empty: any frame. Grids
-    /// are published in this frame, and poses of two frames would jump.
+    /// The decoder, which refuses poses of the topic of poses in another frame than `fixed_frame`; empty: any frame.
+    /// Grids are published in this frame, and poses of two frames would jump.
     pub fn posed_in(self, fixed_frame: &str) -> Self {
         Self { fixed_frame: fixed_frame.to_owned(), ..self }
     }
@@ -262,7 +262,7 @@ impl TopicDecoder {
     }
 
     /// The ego pose with its speed, computed from the forward distance since the pose before. `None` for the first
-    /// pose, for a repeated stamp, and if the stamps step back: the poses after the step are computed from this one,
+    /// pose, for a repeated stamp, and if the stamps step back: the poses after the step are computed from this pose,
     /// and the pipeline decides whether an epoch has begun.
     fn pose_with_speed(&mut self, stamp_ns: i64, map_from_ego: Isometry3<f64>) -> Option<EgoPose> {
         if self.newest.is_some_and(|(before_ns, _)| before_ns == stamp_ns) {

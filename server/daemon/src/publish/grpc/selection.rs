@@ -105,7 +105,7 @@ impl Rate {
         self.period_ns == 0 || self.due_ns.is_none_or(|due_ns| stamp_ns >= due_ns)
     }
 
-    /// Records that a map captured at `stamp_ns` was sent. The next map is due one period after this one was due,
+    /// Records that a map captured at `stamp_ns` was sent. The next map is due one period after this map was due,
     /// however late it came, so that the mean rate is kept even if the map rate is no multiple of it; a reader that was
     /// away does not catch up. The quarter of a period allows for jitter of the maps.
     pub fn send(&mut self, stamp_ns: i64) {
@@ -122,7 +122,7 @@ impl Rate {
         };
     }
 
-    /// How many of `between` maps, captured between two sent ones, the rate would have allowed.
+    /// How many of `between` maps, captured between two sent maps, the rate would have allowed.
     fn room(&self, between: u64, sent_ns: [i64; 2]) -> u64 {
         if self.period_ns == 0 {
             return between;
@@ -131,7 +131,7 @@ impl Rate {
         between.min(u64::try_from(periods - 1).unwrap_or(0))
     }
 
-    /// Maps between two sent ones: (missed, left out because of the rate).
+    /// Maps between two sent maps: (missed, left out because of the rate).
     pub fn between(&self, last: Sent, next: Sent) -> (u64, u64) {
         if last.boot_id != next.boot_id {
             // A jump of a replay, which leaves nothing out.

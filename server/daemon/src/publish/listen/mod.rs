@@ -6,7 +6,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | `slots` | peers -> connections and calls within the limits, in all and of one address; idle ones closed |
+//! | `slots` | peers -> connections and calls within the limits, in all and of one address; idle connections closed |
 //! | `tls` | certificates -> TLS, names of clients |
 //! | [`access`] | names -> roles -> RPCs and paths, vehicles and layers |
 //! | [`security`] | certificates, roles and tokens that hold at present |

@@ -201,7 +201,7 @@ impl ConnectionSlots {
         locked(&self.0).close(|connection| (!connection.calls.values().all(&is_allowed)).then_some("role_lost"));
     }
 
-    /// Closes up to `most` connections without a call, idle ones first, to free file handles; returns how many.
+    /// Closes up to `most` connections without a call, idle connections first, to free file handles; returns how many.
     pub fn free(&self, most: usize) -> usize {
         let mut slots = locked(&self.0);
         (0..most).take_while(|_| slots.close_idlest(|_| true)).count()
@@ -302,7 +302,7 @@ impl ConnectionSlot {
         Ok(())
     }
 
-    /// Begins a call; `None` if too many calls of all peers or of this one's address are in progress.
+    /// Begins a call; `None` if too many calls of all peers or of this peer's address are in progress.
     pub fn begin_call(self: &Arc<Self>, authorization: Authorization) -> Option<CallPermit> {
         let (mut slots, address) = (locked(&self.slots.0), self.address());
         let calls = |of: &dyn Fn(&OpenConnection) -> bool| -> usize {

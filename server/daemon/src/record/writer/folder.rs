@@ -1,4 +1,4 @@
-//! The files of a recording: their names, how they become visible, and which old ones are deleted.
+//! The files of a recording: their names, how they become visible, and which old files are deleted.
 //!
 //! The parts of `drive.mcap` are `drive.mcap`, `drive.part-0002.mcap`, `drive.part-0003.mcap`, ... A part is written as
 //! `drive.unfinished.mcap` or `drive.part-0002.unfinished.mcap`, and gets its name when it is closed and on the disk.

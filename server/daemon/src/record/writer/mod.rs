@@ -5,7 +5,7 @@
 //! | `handle` | one vehicle's events and maps -> the queue; the pipeline of the vehicle's next keyframe |
 //! | `recording` | the queue -> parts on the disk |
 //! | `part` | one open part: its file, its counts |
-//! | `folder` | parts -> files: names, links of saved parts, deletion of old ones |
+//! | `folder` | parts -> files: names, links of saved parts, deletion of old parts |
 //! | `counts` | what was offered, written, dropped and is durable |
 //! | `control` | requests of operators -> the recorder's thread |
 //!

@@ -23,11 +23,11 @@ const LOSS_WARNS: f64 = 0.01;
 const LOSS_ENDS: f64 = 0.005;
 /// Completeness of the newest revolution below which a sensor warns. Ours.
 const COMPLETENESS_MIN: f32 = 0.9;
-/// Packets of a revolution beside those that its model sends, above which they are of another model. Ours: an HDL-32E,
-/// which can be read as a VLP-16, sends 2.4 times as many.
+/// Greatest ratio of a revolution's packets to the packets that its model sends; above it they are of another model.
+/// Ours: an HDL-32E, which can be read as a VLP-16, sends 2.4 times as many.
 const MODEL_PACKETS_MAX: f64 = 1.5;
 
-/// State of a vehicle, better ones first.
+/// State of a vehicle, better states first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum State {
     /// Fresh maps are made, and nothing is known to be wrong.
