@@ -201,7 +201,7 @@ fn order_of(file: &Path) -> (String, usize, String) {
     let (stem, ending) = name.split_once('.').unwrap_or((&name, ""));
     let text = stem.trim_end_matches(|c: char| c.is_ascii_digit());
     let number = stem[text.len()..].trim_start_matches('0');
-    // Of two numbers without leading zeros, the one with fewer digits is less.
+    // Of two numbers without leading zeros, the number with fewer digits is less.
     (text.to_owned(), number.len(), format!("{number}.{ending}"))
 }
 

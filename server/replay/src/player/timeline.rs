@@ -163,7 +163,7 @@ impl Ahead {
 struct Merged {
     tracks: Vec<(Readings, Option<Reading>)>,
     faults: Faults,
-    /// Number of readings so far, with those that a fault has dropped.
+    /// Number of readings so far, with readings that a fault has dropped.
     number: u64,
     /// Recorded time of the first reading.
     begin_ns: Option<i64>,
