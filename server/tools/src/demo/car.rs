@@ -60,7 +60,7 @@ impl DemoCar {
         let observer = {
             let (rig, halt, skipped, progress) = (rig.clone(), halt.clone(), new_skipped(), progress(newest));
             let (runtime, name) = (tokio::runtime::Handle::current(), name.to_owned());
-            // The poses of a car with one sensor are no earlier than its packets, on a machine that is late with those.
+            // The poses of a car with one sensor are no earlier than its packets, if the machine is late with packets.
             let firing_ns = rig.units.is_empty().then(|| newest_firing_ns.clone());
             let observe = move || runtime.block_on(observe(&name, rig, grpc, halt, firing_ns, progress, skipped));
             std::thread::Builder::new().name("simulated car".into()).spawn(observe)?

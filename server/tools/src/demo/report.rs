@@ -54,7 +54,7 @@ impl Default for DemoReport {
 }
 
 impl DemoReport {
-    /// The report that follows this one.
+    /// The report that follows this report.
     pub fn next(&self, elapsed: Duration, snapshot: Snapshot, age_ms: Option<f64>, skipped: Duration) -> Self {
         let newly_skipped = skipped.saturating_sub(self.skipped);
         Self { elapsed, snapshot, age_ms, skipped, newly_skipped, ..*self }

@@ -32,7 +32,7 @@ const SETTLE: Duration = Duration::from_millis(500);
 pub const RECORDING_MIB: u64 = 2048;
 /// As [`RECORDING_MIB`], of a black box.
 pub const BLACK_BOX_MIB: u64 = 256;
-/// The names of a fleet's vehicles; further ones have numbers.
+/// The names of a fleet's vehicles; further vehicles have numbers.
 const NAMES: [&str; 5] = ["car", "van", "truck", "bus", "shuttle"];
 /// From one vehicle of a fleet to the next along its course, in metres.
 const APART_M: f64 = 45.0;
@@ -71,7 +71,7 @@ pub struct DemoEndpoints {
     pub zenoh: Vec<String>,
     /// The sensors, and why they were chosen.
     pub sensors: String,
-    /// Ports that differ from the usual ones, and why.
+    /// Ports that differ from the usual ports, and why.
     pub notes: Vec<String>,
 }
 

@@ -60,7 +60,8 @@ impl SensorChoice {
         }
     }
 
-    /// The first model that takes no more than [`SHARE_MAX`] of all cores; the one with the fewest lasers if none does.
+    /// The first model that takes no more than [`SHARE_MAX`] of all cores; the model with the fewest lasers if none
+    /// does.
     fn affordable(core_share: impl Fn(Model) -> f64) -> Self {
         let cores = available_parallelism().map_or(1, usize::from) as f64;
         let mut core_shares = Vec::new();

@@ -128,7 +128,7 @@ impl EvaluatedRow {
     }
 }
 
-/// Counts by object, distance in metres and layer: the cells with the object in them, and those called free.
+/// Counts by object, distance in metres and layer: the cells with the object in them, and how many are called free.
 pub type ObjectCounts = BTreeMap<(&'static str, u32), Vec<(String, CellCount)>>;
 
 /// The counts of a layer, which are made if there are none.

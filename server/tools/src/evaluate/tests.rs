@@ -62,7 +62,7 @@ fn a_hand_made_street_gets_the_metrics_counted_by_hand() {
     assert_eq!(tally.drivable.of_them + tally.not_reached.of_them, tally.drivable.all);
     assert!(tally.not_reached.of_them <= 4 && tally.road_recall() > Some(0.999), "{tally:?}");
     assert!(tally.leaks.is_empty(), "{:?}", tally.leaks);
-    // Every ground point, road or terrain, except those in the cells of the wall; no point of the wall.
+    // Every ground point, road or terrain, except points in the cells of the wall; no point of the wall.
     let ground = points.iter().filter(|(_, class)| *class != 50).count() as u64;
     for protocol in tally.points {
         assert_eq!((protocol.right + protocol.missed, protocol.wrong), (ground, 0));

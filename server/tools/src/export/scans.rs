@@ -108,7 +108,7 @@ impl ScanDecoder {
         let event = v1::Event::decode(event).with_context(|| format!("journal of {vehicle}"))?;
         let index = event.source as usize;
         if let Some(Body::Sensor(sensor)) = &event.body {
-            // A repeated declaration changes nothing; another one at its index follows its withdrawal.
+            // A repeated declaration changes nothing; another declaration at its index follows its withdrawal.
             let is_known = |known: &OneSensor| known.declaration.as_ref().is_none_or(|known| known == sensor);
             if !sensors.get(&index).is_some_and(is_known) {
                 let ahead_ns_max = sensors.values().next().map_or(0, |first| first.ahead_ns_max);

@@ -65,7 +65,7 @@ impl Picture {
         }
     }
 
-    /// Copies a picture into this one, which is large enough.
+    /// Copies a picture into this picture, which is large enough.
     pub fn place(&mut self, (x, y): (usize, usize), picture: &Self) {
         for (row, pixels) in picture.rgb.chunks(picture.width.max(1)).enumerate() {
             self.rgb[(y + row) * self.width + x..][..picture.width].copy_from_slice(pixels);

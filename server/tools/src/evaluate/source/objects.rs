@@ -90,7 +90,7 @@ pub fn judge_objects(
     Ok(())
 }
 
-/// The cells of a layer at these places, and those called free; `None` if the layer has no free class.
+/// The cells of a layer at these places, and the cells among them called free; `None` if the layer has no free class.
 fn count(layer: &Layer, places: &[[f32; 3]]) -> Option<CellCount> {
     let (meanings, cell_of) = (meanings(layer)?, locate(&layer.geometry));
     let cells: BTreeSet<usize> = places.iter().filter_map(|place| cell_of(*place)).collect();
