@@ -43,7 +43,7 @@ export class Feed {
     else this.#repaint();
   }
 
-  // Sends the selection: it is another one, or the connection is new.
+  // Sends the selection: the selection has changed, or the connection is new.
   begin() {
     if (!this.#want) return;
     const { layers, max_rate_hz, deltas } = this.#want;

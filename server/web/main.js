@@ -92,7 +92,7 @@ function draw() {
   const drawn = [...frames];
   frames.clear();
   for (const [vehicle, frame] of drawn) {
-    // The Worker sends the next frame after this, even if this one cannot be drawn.
+    // The Worker sends the next frame after this, even if this frame cannot be drawn.
     post({ type: "drawn", vehicle });
     if (view.name === null) fleet.frame(vehicle, frame);
     else if (vehicle === view.name) view.frame(frame);

@@ -62,7 +62,7 @@ export function fadeSlices(pixels, table, { is_straight, shape: [rows, columns],
 }
 
 // Draws a layer over pixels that are painted: half of its colour and half of theirs. colours: an ImageData word for
-// each raw value, 0 for those that leave a pixel as it is.
+// each raw value, 0 for values that leave a pixel as it is.
 export function blendPixels(pixels, table, cells, colours) {
   const low = least(cells), half = 0x7f7f7f7f;
   for (let i = 0; i < table.length; i++) {

@@ -11,7 +11,7 @@ const viewOf = (bytes) => new DataView(bytes.buffer, bytes.byteOffset, bytes.byt
 // True if a message begins as a frame of points does. A MapUpdate never does.
 export const isPoints = (bytes) => bytes.length >= 4 && viewOf(bytes).getUint32(0, true) === MAGIC;
 
-// { vehicle, capture_end_ns, total: points of the map, count: those in the frame, xyz: Int16Array, centimetres, ego
+// { vehicle, capture_end_ns, total: points of the map, count: points in the frame, xyz: Int16Array, centimetres, ego
 // frame }. Throws a DecodeError.
 export function readPoints(bytes) {
   const error = (what) => new DecodeError("points", what);
