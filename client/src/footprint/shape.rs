@@ -193,8 +193,8 @@ pub(super) struct PathPose {
 }
 
 impl Path {
-    /// Poses of a vehicle, each at most [`STEP_M`] from the one before and turned by so little that its farthest corner
-    /// moves at most as far by that; with both ends.
+    /// Poses of a vehicle, each at most [`STEP_M`] from the pose before and turned by so little that its farthest
+    /// corner moves at most as far by that; with both ends.
     pub(super) fn poses(&self, outline: &Outline) -> Result<Vec<PathPose>, ShapeError> {
         match self {
             Self::Places(given) => straight_poses(given, outline.reach_m()),
@@ -292,7 +292,7 @@ fn path_length(what: &'static str, value: f64) -> Result<(), ShapeError> {
     if value <= PATH_M_MAX { Ok(()) } else { Err(ShapeError::Length { what, value, allowed }) }
 }
 
-/// The places without those that repeat the place before.
+/// The places, without places that repeat the place before.
 fn places(what: &'static str, given: &[[f64; 2]], one: &str, least: usize) -> Result<Vec<[f64; 2]>, ShapeError> {
     for (index, place) in given.iter().enumerate() {
         for (axis, value) in ["x", "y"].into_iter().zip(place) {

@@ -26,7 +26,7 @@ export class LiveMap {
 
   // map: an encoded Map, or a Map message with the field names of map.proto, 64-bit numbers as BigInt and bytes as
   // Uint8Array. base: the map that deltas start from, or null. With a base every layer is opened at once, so that no
-  // map keeps another one.
+  // map keeps another map.
   constructor(map, base = null) {
     const is_encoded = ArrayBuffer.isView(map);
     this.length = is_encoded ? map.length : 0;

@@ -74,7 +74,7 @@ inline std::optional<std::string> why_of(const Layer& layer, std::size_t cell) {
     return raw >= 0 && raw < 9 ? std::string(REASONS[raw]) : "reason " + std::to_string(raw);
 }
 
-// The answer for checked corners; of several cells that forbid it, the one nearest to `from` is named.
+// The answer for checked corners; of several cells that forbid it, the cell nearest to `from` is named.
 inline Answer answer(const Layer& layer, const Polygon& corners, Point from) {
     const touching::Touched found = touching::touched(layer.grid, corners);
     const auto nearest = [&](Verdict wanted) -> std::optional<Blocker> {
