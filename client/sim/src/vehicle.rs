@@ -219,8 +219,8 @@ impl SimulatedVehicle {
         TrueRevolution { revolution, map_from_ego, truth }
     }
 
-    /// Revolution `number`, whole, through real datagrams and the decoder: the one whose middle is the encoder's zero,
-    /// ahead of the vehicle, at time `number * 60 / rpm`.
+    /// Revolution `number`, whole, through real datagrams and the decoder: the revolution whose middle is the encoder's
+    /// zero, ahead of the vehicle, at time `number * 60 / rpm`.
     ///
     /// # Panics
     /// As [`SimulatedVehicle::true_revolution`].
@@ -234,7 +234,7 @@ impl SimulatedVehicle {
         };
         let mut sensor = Sensor::new(config);
         // The decoder ends revolutions behind the vehicle, half a revolution before the encoder's zero. A firing whose
-        // angle rounds to that one begins a revolution one firing early.
+        // angle rounds to that angle begins a revolution one firing early.
         let half_revolution_ns = (30e9 / self.scanner.config().rpm) as i64;
         let slack_ns = self.scanner.firing_ns(2);
         let begins_ns = self.start_ns + self.scanner.firing_ns(self.scanner.first_firing_of(number))
