@@ -9,7 +9,7 @@ const INTENSITIES: &[&str] = &["intensity", "reflectivity"];
 const RINGS: &[&str] = &["ring", "channel", "laser_id", "line"];
 const TIMES: &[&str] = &["time", "t", "timestamp", "time_stamp", "offset_time"];
 
-/// The fields of a point that are read. None of them overlaps another one.
+/// The fields of a point that are read. None of them overlaps another field.
 pub(crate) struct Layout {
     pub position: [FieldReader; 3],
     pub intensity: Option<FieldReader>,
