@@ -92,7 +92,7 @@ async fn stopped_and_slow_readers_cost_the_others_nothing_and_resume_newest() {
         let (sequence, skipped, _) = reader.receive().await;
         assert_eq!((sequence, skipped), (next - 1, next - 2 - on_the_way[1]), "the first new map is the newest one");
     }
-    // The slow reader has at most its credits in flight; after those it receives the newest map.
+    // The slow reader has at most its credits in flight; after these maps it receives the newest map.
     link.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
     let (mut before, mut seen) = (slow.receive().await, 1);
     while before.0 < next - 1 {

@@ -57,7 +57,7 @@ fn the_golden_recordings_are_read_by_every_version() {
     assert!(said.contains(" recorded the file, "), "{said}");
 }
 
-/// Reads all events and maps of a golden recording, whose program had these layers beside the first ones.
+/// Reads all events and maps of a golden recording, whose program had these layers beside the first layers.
 fn read_whole(file: &Path, more_layers: &[&str]) {
     let mut recording = RecordingReader::open(file).unwrap();
     let (config, tables) = run_config(&recording).unwrap();
