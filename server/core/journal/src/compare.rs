@@ -48,7 +48,7 @@ pub struct Comparison {
     /// True if events are missing. The maps after them are not compared with maps of a configuration: the missing
     /// events alone may make them differ.
     pub is_ended_by_loss: bool,
-    /// What changed, by vehicle and layer.
+    /// Changes by vehicle and layer.
     pub layers: BTreeMap<(String, String), LayerChange>,
     /// The maps with the greatest share of changed cells: the first map of each layer, greatest share first, then the
     /// second map of each layer, and so on.
@@ -144,7 +144,7 @@ pub enum CompareError {
     NoMaps {
         /// Path of the recording without maps.
         file: PathBuf,
-        /// What it holds of them.
+        /// What the recording holds of the maps.
         maps: RecordedMaps,
     },
     /// The configuration does not fit the sensors of the recording: events name sensors by their place in the list.
@@ -154,7 +154,7 @@ pub enum CompareError {
     Misfit {
         /// Path of the recording that the configuration does not fit.
         file: PathBuf,
-        /// What does not fit.
+        /// The kind of names that do not fit, in words.
         what: String,
         /// The names in the configuration.
         given: String,

@@ -112,9 +112,9 @@ pub enum McapReadError {
     Version {
         /// Path of the file that is too new.
         file: PathBuf,
-        /// What the file has.
+        /// The format or message schema of the file, in words.
         found: String,
-        /// What this version reads.
+        /// The formats or schemas that this clearway reads, in words.
         known: String,
         /// The version that wrote the file.
         by: String,

@@ -56,7 +56,7 @@ pub enum RepairError {
     Nothing {
         /// Path of the damaged file.
         file: PathBuf,
-        /// How it is incomplete.
+        /// How the damaged file is incomplete; `None` if it is whole.
         incomplete: Option<String>,
     },
     /// The new file cannot be created or moved to its name.
@@ -82,7 +82,7 @@ pub enum RepairError {
         file: PathBuf,
         /// Number of messages that were written.
         written: u64,
-        /// Number of messages that it has.
+        /// Number of messages that the new file has.
         found: u64,
     },
 }
