@@ -29,9 +29,9 @@ pub enum ControlError {
         what: &'static str,
         /// The requested time, in seconds after the first event.
         at_s: f64,
-        /// Begin of what is allowed.
+        /// Begin of the played range, in seconds after the first event.
         from_s: f64,
-        /// End of what is allowed.
+        /// End of the played range, in seconds after the first event.
         to_s: f64,
     },
     /// The range ends before it begins.
@@ -140,7 +140,7 @@ pub struct ReplayInput {
 }
 
 impl ReplayHandle {
-    /// A handle and its other end.
+    /// A handle, and the input on which the replay receives its requests.
     pub fn new(state: v1::ReplayState) -> (Self, ReplayInput) {
         let (commands, requests) = mpsc::unbounded_channel();
         let (sender, state) = watch::channel(state);

@@ -59,7 +59,7 @@ impl Default for Connections {
     }
 }
 
-/// What listens on an address.
+/// A kind of listener on an address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Service {

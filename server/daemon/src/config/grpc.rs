@@ -16,7 +16,7 @@ use super::error::{ConfigError, ValueError, beside};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Grpc {
-    /// True if it is served.
+    /// True if gRPC is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,

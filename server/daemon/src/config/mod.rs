@@ -96,7 +96,7 @@ pub struct Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Page {
-    /// True if it is served.
+    /// True if the page is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
@@ -129,7 +129,7 @@ impl Page {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Metrics {
-    /// True if it is served.
+    /// True if the listener of the metrics is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
@@ -145,7 +145,7 @@ impl Default for Metrics {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Foxglove {
-    /// True if it is served.
+    /// True if the WebSocket for Foxglove is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,

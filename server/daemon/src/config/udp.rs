@@ -47,9 +47,9 @@ impl Default for Udp {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ports {
-    /// Port of its data packets.
+    /// Port that receives the sensor's data packets.
     pub data: u16,
-    /// Port of its telemetry.
+    /// Port that receives the sensor's telemetry.
     pub telemetry: u16,
 }
 

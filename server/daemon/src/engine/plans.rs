@@ -26,7 +26,7 @@ pub type NewestPlan = Option<Arc<v1::Plan>>;
 /// Why a plan is not taken.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PlanRefused {
-    /// It cannot be drawn.
+    /// The plan cannot be drawn.
     #[error(transparent)]
     Plan(#[from] PlanError),
     /// There are too many plans.

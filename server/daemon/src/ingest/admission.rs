@@ -184,7 +184,7 @@ pub enum StreamLimitError {
     Host {
         /// Address of the host.
         host: IpAddr,
-        /// Number of its streams.
+        /// Number of open streams of the host.
         streams: usize,
         /// Greatest number of streams of all hosts.
         streams_max: usize,

@@ -36,7 +36,7 @@ pub(super) type Unreported = BTreeMap<(Cause, u16), u64>;
 /// A sender of datagrams that is none of the vehicle's sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UnknownSender {
-    /// Source address of its datagrams.
+    /// Source address of the sender's datagrams.
     pub address: SocketAddr,
     /// Number of its datagrams since it is remembered.
     pub datagrams: u64,

@@ -55,7 +55,7 @@ pub enum Arrival {
 /// A reading that cannot be made to wait.
 #[derive(Debug)]
 pub struct LiveReading {
-    /// When it arrived.
+    /// When the reading arrived.
     pub arrival: Arrival,
     /// Index of the sensor in the vehicle's configuration.
     pub source: u16,

@@ -15,7 +15,7 @@ use super::sensor_senders::SensorSender;
 pub enum Outcome {
     /// The core accepted it, and the map that it completed, if any, is published.
     Accepted,
-    /// It was refused.
+    /// The event was refused, by the gateway or by the core.
     Refused {
         /// Key in the ledger under which the refusal is counted.
         reason: &'static str,
@@ -86,7 +86,7 @@ impl Drop for Receipt {
 pub struct NumberError {
     /// Number of the refused observation.
     pub number: u64,
-    /// The greatest number before it.
+    /// The greatest number among the observations before.
     pub newest: u64,
 }
 

@@ -19,7 +19,7 @@ const SENDERS_MAX: usize = 4;
 /// A sender of a sensor's data.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SensorSender {
-    /// Source address of its datagrams.
+    /// Source address of the sender's datagrams.
     Address(SocketAddr),
     /// What names it alone.
     Named(Arc<str>),

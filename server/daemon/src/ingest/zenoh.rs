@@ -110,7 +110,7 @@ struct Queues {
 struct Queue {
     source: Option<ZenohId>,
     samples: Arc<SourceQueue<Sample>>,
-    /// When its newest sample came.
+    /// Time at which the queue's newest sample came.
     heard: Instant,
     /// True if an observation of it was accepted.
     is_accepted: Arc<AtomicBool>,

@@ -36,7 +36,7 @@ pub(super) const SILENT_MAX: Duration = Duration::from_secs(600);
 
 /// A sample that is not decoded yet.
 pub(super) struct Sample {
-    /// Empty if it is too long.
+    /// Bytes of the sample; empty if they are too long.
     pub payload: ZBytes,
     /// Length of the payload as it came.
     pub length: usize,
@@ -186,7 +186,7 @@ struct Clients {
 }
 
 struct Client {
-    /// When its newest observation came.
+    /// Time at which the client's newest observation came.
     heard: Instant,
     id: u64,
     session: ClientSession,

@@ -80,7 +80,7 @@ struct All {
     published: Arc<watch::Sender<u64>>,
 }
 
-/// What a channel carries.
+/// The kind of a channel's messages.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Kind {
     Layer(&'static str),
@@ -306,12 +306,12 @@ struct Client {
 /// One client's subscription to one channel.
 struct Subscription {
     newest: watch::Receiver<Option<Message>>,
-    /// Keeps its layer active.
+    /// Keeps the channel's layer active.
     layer: Option<LayerSubscription>,
     reader: Reader,
 }
 
-/// What a client may ask for.
+/// A client's request, as JSON.
 #[derive(Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase")]
 enum Request {

@@ -23,7 +23,7 @@ const ASSESS_PERIOD: Duration = Duration::from_millis(200);
 /// Time after which another server that claims the vehicle's name is forgotten. Ours: it publishes once a second.
 const CLAIM_AGE_MAX: Duration = Duration::from_secs(4);
 
-/// What an assessment has found.
+/// The result of an assessment of one vehicle.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Assessment {
     /// State of the vehicle's maps.

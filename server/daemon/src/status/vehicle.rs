@@ -50,7 +50,7 @@ pub struct VehicleStatus {
     pub layers: Vec<&'static str>,
     /// The readers of its maps, by transport.
     pub transports: Arc<Readers>,
-    /// Collects the traces of its maps.
+    /// Collects the traces of the vehicle's maps.
     pub traces: Traces,
     /// Outline of the vehicle in the ego frame as x0, y0, x1, y1, ..., in metres; empty if none is configured.
     pub(super) outline_m: Vec<f64>,
@@ -118,7 +118,7 @@ pub(crate) struct MadeMap<'a> {
     pub states: Vec<v1::SensorState>,
     /// Time that it took in each stage.
     pub stages: StageTimes,
-    /// Age at which it is stale.
+    /// Age at which the map is stale.
     pub validity: Duration,
     /// Speed of the vehicle.
     pub speed_m_s: Option<f64>,

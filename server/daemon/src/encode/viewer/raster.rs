@@ -44,7 +44,7 @@ pub struct Raster {
     grid: Grid,
     /// Cells along the raster's x axis.
     pub width: u32,
-    /// Cells along its y axis.
+    /// Number of cells along the raster's y axis.
     pub height: u32,
     /// Edge of a cell, in metres.
     pub cell_m: f32,
@@ -104,7 +104,7 @@ impl Raster {
         }
     }
 
-    /// Number of its cells.
+    /// Number of cells of the raster.
     pub fn cells(&self) -> usize {
         self.width as usize * self.height as usize
     }

@@ -46,7 +46,7 @@ pub struct ShownLayer<'a> {
 pub struct LayerTopic {
     /// End of the topic's name, behind the layer's.
     pub ending: &'static str,
-    /// Type of its messages.
+    /// Message type of the topic.
     pub kind: Published,
     /// True if a later subscriber gets the newest message.
     pub is_latched: bool,

@@ -85,7 +85,7 @@ const RESETS_FOR_MISTAKES_MAX: usize = 128;
 /// Interval and timeout of HTTP/2 keepalive: a client that has disappeared is noticed after both.
 const KEEPALIVE: Duration = Duration::from_secs(10);
 
-/// What a listener speaks.
+/// The protocol of a listener.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Protocol {
     /// HTTP/2 with gRPC: refusals are a gRPC status.
@@ -163,7 +163,7 @@ impl Listener {
         (Self { socket, shared: shared.clone(), all: all.clone() }, ListenerHandle(shared))
     }
 
-    /// The address it listens on.
+    /// The address on which the listener accepts; `None` if it has none.
     pub fn address(&self) -> Option<SocketAddr> {
         self.socket.local_addr().ok()
     }

@@ -63,7 +63,7 @@ pub struct Authorization {
     pub path: String,
     /// The names in the certificate and of the token.
     pub names: Vec<String>,
-    /// What the client may reach.
+    /// The client, with the vehicles and layers that it may reach.
     pub caller: Caller,
 }
 

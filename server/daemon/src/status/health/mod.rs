@@ -82,7 +82,7 @@ pub struct Facts {
     pub unknown_senders: Vec<String>,
     /// Share of the packets of the last 10 s that were lost or refused, 0 to 1; `None` if none was expected.
     pub loss: Option<f64>,
-    /// What is wrong with the recording.
+    /// Fault of the recording, in words; `None` if there is none.
     pub recorder_problem: Option<String>,
     /// What is wrong with the long-term store.
     pub store_problem: Option<String>,
@@ -104,7 +104,7 @@ pub struct SensorFacts {
     /// Why its newest scan is not, or not as it should be, in the newest map: "late", "ahead", "empty",
     /// "silent"; else empty.
     pub left_out: String,
-    /// Covered share of its newest revolution.
+    /// Share of the sensor's newest revolution that is covered, 0 to 1.
     pub completeness: Option<f32>,
     /// Packets of its newest revolution, if it is whole, and how many its model sends in one.
     pub packets: Option<[u32; 2]>,
@@ -125,9 +125,9 @@ pub struct SensorFacts {
 /// One thing that is wrong.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {
-    /// How bad it is.
+    /// State that the finding causes.
     pub state: State,
-    /// What it is, in words.
+    /// The fault, in words.
     pub text: String,
 }
 
