@@ -19,7 +19,7 @@ pub(super) struct Recorded {
     pub config: Config,
     /// The recorded calibration tables, by vehicle and sensor.
     pub tables: Calibrations,
-    /// Boot id of its maps.
+    /// Boot id of the recorded maps.
     pub boot_id: u64,
 }
 

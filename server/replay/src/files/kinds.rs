@@ -42,9 +42,9 @@ pub enum FilesError {
     Converted {
         /// Path of the file.
         file: PathBuf,
-        /// What it is.
+        /// The kind of the file, in words.
         what: &'static str,
-        /// The command that converts it.
+        /// The command that converts the file.
         advice: String,
     },
     /// A folder has no file of a known kind.

@@ -44,7 +44,7 @@ enum FaultKind {
 pub struct FaultError {
     /// The fault as given.
     pub text: String,
-    /// What is wrong with it.
+    /// Why the fault is refused.
     pub reason: String,
 }
 

@@ -22,7 +22,7 @@ const AHEAD: usize = 1024;
 pub struct Track {
     /// Paths of the files, in the order of their times.
     pub files: Vec<PathBuf>,
-    /// What is read of them.
+    /// Options with which the files are read.
     pub options: McapOptions,
 }
 

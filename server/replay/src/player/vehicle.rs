@@ -13,7 +13,7 @@ use crate::files::mcap::RefusedMessages;
 pub struct ReplayedVehicle {
     /// Engine that makes the vehicle's maps.
     pub engine: Engine,
-    /// The events of its queue.
+    /// Receiver of the events on the engine's queue.
     pub events: Receiver<QueuedEvent>,
     /// Event queue of the engine.
     pub queue: EventQueue,

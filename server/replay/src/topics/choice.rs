@@ -42,7 +42,7 @@ pub enum ChoiceError {
 pub struct SensorTopic {
     /// Name of the topic.
     pub topic: String,
-    /// The frame of its messages.
+    /// Frame of the topic's messages.
     pub frame_id: String,
     /// The frame of the tf tree that is taken for it: itself, or the only one with its name in another namespace.
     pub placed_frame: String,
