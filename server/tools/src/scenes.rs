@@ -10,7 +10,7 @@ const STREET_MPS: f64 = 8.0;
 pub struct NamedScene {
     /// Name of the scene on the command line.
     pub name: &'static str,
-    /// What it shows.
+    /// What the scene shows, in words.
     pub description: &'static str,
     /// Number of revolutions by which maps are judged: one where nothing moves.
     pub revolutions: u64,

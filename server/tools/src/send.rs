@@ -49,7 +49,7 @@ pub struct SendOptions {
     pub faults: Option<Faults>,
 }
 
-/// What was sent.
+/// Counts of what was sent, with the time that it took.
 #[derive(Clone, Debug)]
 pub struct SendSummary {
     /// Number of datagrams.

@@ -33,7 +33,7 @@ pub struct DemoReport {
 pub struct DemoSummary {
     /// The last report, with complete counts.
     pub last: DemoReport,
-    /// What the cars sent.
+    /// Counts of what the cars sent.
     pub sent: Sent,
     /// Processor time of this process over the time, the simulation's too; `None` where the system does not tell it.
     pub cores: Option<f64>,

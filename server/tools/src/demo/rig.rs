@@ -43,7 +43,7 @@ pub struct Rig {
 pub struct TimedObservation {
     /// When it is sent, ns since the Unix epoch.
     pub stamp_ns: i64,
-    /// What is sent.
+    /// The observation that is sent at this time.
     pub observation: Observation,
 }
 

@@ -41,7 +41,7 @@ const FAILING: usize = 1;
 const DRIVES: Duration = Duration::from_secs(60);
 const FAILS: Duration = Duration::from_secs(20);
 
-/// What a demo does.
+/// Options of a demo.
 #[derive(Clone, Debug, Default)]
 pub struct DemoOptions {
     /// How long the demo runs; `None`: until `stop` resolves.

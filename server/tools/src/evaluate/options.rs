@@ -14,7 +14,7 @@ use super::source::variation::Variation;
 /// in odd seeds.
 pub const SEEDS: Range<u64> = 0..156;
 
-/// What is judged, and how.
+/// Options of an evaluation: inputs, configuration and outputs.
 #[derive(Clone, Debug)]
 pub struct EvaluateOptions {
     /// Folders with scans and labels, scans, `sim:` with the name of a scene, or `sim:random`.

@@ -147,7 +147,7 @@ pub struct EvaluatedWorld {
     pub seed: u64,
     /// Theme and form.
     pub name: String,
-    /// What was drawn.
+    /// The drawn ground and objects in words.
     pub description: String,
     /// Counts of the world's cells and points.
     pub row: EvaluatedRow,

@@ -28,7 +28,7 @@ mod plans;
 mod scans;
 mod viewer_file;
 
-/// What is exported, and where to.
+/// Options of an export: recording, layers, format and target.
 #[derive(Clone, Debug)]
 pub struct ExportOptions {
     /// Path of the recording, an MCAP file.
@@ -62,7 +62,7 @@ pub enum ExportFormat {
     Ros2,
 }
 
-/// What was exported.
+/// Counts of what was exported.
 #[derive(Clone, Debug, Default)]
 pub struct Exported {
     /// Number of maps, by layer.
