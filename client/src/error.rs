@@ -16,7 +16,7 @@ pub enum ClientError {
     Address {
         /// The text as given.
         address: String,
-        /// What is wrong with it.
+        /// Why the address is refused.
         reason: String,
     },
     /// A certificate or a key is invalid, or they do not belong together.
@@ -24,7 +24,7 @@ pub enum ClientError {
     Certificate {
         /// Address of the server or router.
         address: String,
-        /// What is wrong with them.
+        /// Why the certificate or key is refused.
         reason: String,
     },
     /// No server answers at the address, or the connection failed.

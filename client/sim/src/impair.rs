@@ -36,7 +36,7 @@ pub struct Faults {
 pub struct Counts {
     /// Datagrams that were sent.
     pub sent: u64,
-    /// Datagrams that arrived, copies among them.
+    /// Number of datagrams that arrived, with copies.
     pub arrived: u64,
     /// Data packets lost, in bursts or alone.
     pub packets_lost: u64,

@@ -54,7 +54,7 @@ pub enum ShapeError {
     Crossing {
         /// The edges, by the number of their first corner.
         edges: [usize; 2],
-        /// Where they cross, in metres.
+        /// Point at which the edges cross, in metres.
         at_m: [f64; 2],
     },
 }

@@ -37,11 +37,11 @@ use draw::Draw;
 pub struct RandomWorld {
     /// Seed of the world.
     pub seed: u64,
-    /// Form of its ground.
+    /// Form of the ground.
     pub form: Form,
-    /// What stands in it.
+    /// Theme: the kind of objects in the world.
     pub theme: Theme,
-    /// What was drawn, with its measures.
+    /// The drawn ground and objects in words, with their measures.
     pub description: String,
     /// The world, in which the vehicle stands still. Its name is the theme's name.
     pub scene: Scene,
