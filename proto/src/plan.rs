@@ -76,7 +76,7 @@ pub enum PlanError {
     Length {
         /// Field with the text, as in `clearway.v1.Plan`.
         field: &'static str,
-        /// Its length in bytes.
+        /// Length of the text, in bytes.
         bytes: usize,
         /// Greatest length in bytes.
         bytes_max: usize,

@@ -85,7 +85,7 @@ pub enum MapError {
         layer: String,
         /// Name of the channel.
         channel: String,
-        /// What is wrong with the cells.
+        /// Fault of the cells.
         source: DecodeError,
     },
     /// A delta came without its base map, or the base map does not have the layer.
@@ -111,7 +111,7 @@ pub enum MapError {
     BaseShape {
         /// Name of the layer.
         layer: String,
-        /// What is different.
+        /// How the grids differ.
         source: BaseError,
     },
     /// The class table of a channel was refused.
@@ -121,7 +121,7 @@ pub enum MapError {
         layer: String,
         /// Name of the channel.
         channel: String,
-        /// What is wrong with the table.
+        /// Fault of the class table.
         source: ByClassError,
     },
     /// A safe point is impossible.
@@ -139,7 +139,7 @@ pub enum MapError {
     Legend {
         /// Name of the layer.
         layer: String,
-        /// What is wrong with the legend.
+        /// Fault of the legend.
         source: LegendError,
     },
     /// A cell has a class that the legend does not name.
