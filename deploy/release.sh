@@ -37,7 +37,7 @@ check_libraries() {
 }
 
 if [ -z "$given" ]; then
-    # With the C library inside, so that it runs on every Linux, also on one that is older than this one.
+    # With the C library inside, so that it runs on every Linux, also on a Linux older than this machine's.
     target=$(rustc -vV | sed -n 's/^host: //p')
     RUSTFLAGS="-C target-feature=+crt-static" cargo build --release --locked --target "$target" \
         --package clearway --no-default-features --features sqlite,store,zenoh

@@ -12,7 +12,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let out = PathBuf::from(env::var("OUT_DIR")?);
     let descriptors = protox::compile(protos, ["."])?;
     fs::write(out.join("clearway.v1.bin"), descriptors.encode_to_vec())?;
-    // A recording carries a schema for each of its messages: those without comments and services.
+    // A recording carries a schema for each of its messages: the schema without comments and services.
     let mut recorded = protox::compile(["clearway/v1/journal.proto"], ["."])?;
     recorded.file.iter_mut().for_each(|file| file.source_code_info = None);
     fs::write(out.join("recording.bin"), recorded.encode_to_vec())?;

@@ -9,8 +9,8 @@
 //! | `clearway_cpp` | a compiler of C++, `c++` |
 //! | `clearway_cpp_grpc` | also `cmake`, and gRPC's library for C++ |
 //! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
-//! | `clearway_deploy` | the tools that lint and start `deploy/`: those of [`DEPLOY`], as root |
-//! | `clearway_namespaces` | what `machines` needs: those of [`NAMESPACES`], as root, and `/dev/net/tun` |
+//! | `clearway_deploy` | the tools in [`DEPLOY`], which lint and start `deploy/`, as root |
+//! | `clearway_namespaces` | the tools in [`NAMESPACES`], which `machines` needs, as root, and `/dev/net/tun` |
 //! | `clearway_browser` | `chromium` and `chromedriver` |
 //! | `clearway_promtool` | `promtool`, which comes with Prometheus |
 //!

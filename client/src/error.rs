@@ -5,7 +5,7 @@ use clearway_proto::plan::PlanError;
 
 use crate::footprint::shape::ShapeError;
 
-/// Why a call failed. `address` is that of the server or router, as the client connected to it.
+/// Why a call failed. `address` is the server's or router's address, as the client connected to it.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum ClientError {
     /// The text is not an address.
@@ -16,21 +16,21 @@ pub enum ClientError {
     Address {
         /// The text as given.
         address: String,
-        /// What is wrong with it.
+        /// Why the address is refused.
         reason: String,
     },
     /// A certificate or a key is invalid, or they do not belong together.
     #[error("certificates for {address}: {reason}")]
     Certificate {
-        /// The address.
+        /// Address of the server or router.
         address: String,
-        /// What is wrong with them.
+        /// Why the certificate or key is refused.
         reason: String,
     },
     /// No server answers at the address, or the connection failed.
     #[error("no clearway server answers at {address}: {reason}")]
     Unreachable {
-        /// The address.
+        /// Address of the server or router.
         address: String,
         /// Error of the transport.
         reason: String,
@@ -38,7 +38,7 @@ pub enum ClientError {
     /// The server refused the call.
     #[error("{address}: {reason} ({code})")]
     Refused {
-        /// The address.
+        /// Address of the server or router.
         address: String,
         /// The server's message: what is wrong and what is allowed.
         reason: String,
@@ -48,7 +48,7 @@ pub enum ClientError {
     /// The server did not report the outcome of observations in time.
     #[error("{address} has acknowledged {acknowledged} of {sent} observations, and then nothing for 10 s")]
     Silent {
-        /// The address.
+        /// Address of the server or router.
         address: String,
         /// Number of observations sent.
         sent: u64,
@@ -58,14 +58,14 @@ pub enum ClientError {
     /// The server ended the stream of maps or observations.
     #[error("{address} has ended the stream")]
     Ended {
-        /// The address.
+        /// Address of the server or router.
         address: String,
     },
     /// The replay that the server serves has reached its end, and its last map was returned. The stream goes on:
     /// further maps come if the replay is set back.
     #[error("{address}: the replay has ended")]
     ReplayEnded {
-        /// The address.
+        /// Address of the server or router.
         address: String,
     },
     /// A received map is invalid.
@@ -108,7 +108,7 @@ pub enum ClientError {
     /// A zenoh operation failed.
     #[error("zenoh, {what}: {reason}")]
     Zenoh {
-        /// The operation.
+        /// The zenoh operation that failed, as the error names it.
         what: String,
         /// Error of zenoh.
         reason: String,

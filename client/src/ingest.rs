@@ -126,12 +126,12 @@ impl Ingester {
             refusals = std::mem::take(&mut outcomes.refusals);
             false
         });
-        // Observations refused before the engine are reported before those that wait for it.
+        // Observations refused before the engine are reported before observations that wait for the engine.
         refusals.sort_by_key(|refusal| refusal.number);
         refusals
     }
 
-    /// Number of refusals that were dropped for newer ones before they were read.
+    /// Number of refusals that were dropped for newer refusals before they were read.
     pub fn forgotten_refusals(&self) -> u64 {
         self.reports.0.borrow().forgotten
     }

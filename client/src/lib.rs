@@ -23,7 +23,7 @@
 //! | `freshness` | two clocks -> least age of a map |
 //! | [`view`] | encoded map -> [`MapView`]: decoded once, cheap to clone, with its age |
 //! | [`footprint`] | map and area, path or point -> what is free, what blocks it, what is nearest, the clearance |
-//! | [`stream`] | updates -> the newest map, with the number of skipped ones |
+//! | [`stream`] | updates -> the newest map, with the number of skipped maps |
 //! | [`grpc`] | address of a server -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
 //! | `signature` | a map on its key and its signature -> whether the expected server published it (feature `zenoh`) |

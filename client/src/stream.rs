@@ -19,7 +19,7 @@ const AFTER_END: Duration = Duration::from_secs(2);
 /// One map from a stream.
 #[derive(Clone, Debug)]
 pub struct Update {
-    /// The newest map.
+    /// The newest map that the stream received.
     pub map: MapView,
     /// Number of maps made since the update before that this reader did not get, because it or its link was slow.
     pub skipped: u64,
@@ -82,9 +82,9 @@ pub struct PassedOver {
     pub misplaced: u64,
     /// Maps without a signature of the expected publisher ([`crate::signature`]).
     pub unsigned: u64,
-    /// Maps of another run of the server while the present run sends fresh ones.
+    /// Maps of another run of the server while the present run sends fresh maps.
     pub other_run: u64,
-    /// Maps that are not newer than the newest (repeated ones).
+    /// Maps that are not newer than the newest map (repeated maps).
     pub not_newer: u64,
 }
 
@@ -116,7 +116,7 @@ struct Counters {
     left_out: u64,
 }
 
-/// Numbers of maps between one stored map and the one before.
+/// Numbers of maps between a stored map and the stored map before it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Missed {
     /// Maps that this reader did not get.
@@ -201,7 +201,7 @@ impl MapStream {
         }
     }
 
-    /// Waits for a map newer than the last one returned, or until that one is stale. A stale map is reported once, at
+    /// Waits for a map newer than the last returned map, or until that map is stale. A stale map is reported once, at
     /// most 20 ms late, by this machine's clocks, also if no further map arrives.
     ///
     /// # Errors
@@ -297,7 +297,7 @@ impl LatestSlot {
         });
     }
 
-    /// Stores a map as the newest, with the numbers of maps between it and the one before, or counts it as passed over
+    /// Stores a map as the newest, with the numbers of maps between it and the map before, or counts it as passed over
     /// ([`refuse`]). `missed` gets the number of maps that the sequence skips, and is called only if the map is stored.
     pub(crate) fn store(&self, map: MapView, missed: impl FnOnce(u64) -> Missed) {
         let map = map.with_arrival(&self.clock);

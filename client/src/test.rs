@@ -1,9 +1,9 @@
 //! For tests of planners: a recording -> a server of its own process that replays it as if live (feature `test`).
 //!
-//! The command `clearway` is the one that the environment variable `CLEARWAY` names, else the one that cargo built
-//! beside the test, else the installed one. The stamps of the maps are shifted to the present, so that their ages are
-//! as on the vehicle. The drive begins when the first reader has subscribed; after its end the last map stays, and
-//! becomes stale. [`Client::replay_control`] pauses, steps and seeks.
+//! The command `clearway` is the command that the environment variable `CLEARWAY` names, else the command that cargo
+//! built beside the test, else the installed command. The stamps of the maps are shifted to the present, so that their
+//! ages are as on the vehicle. The drive begins when the first reader has subscribed; after its end the last map stays,
+//! and becomes stale. [`Client::replay_control`] pauses, steps and seeks.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -41,9 +41,9 @@ pub enum ReplayError {
     /// The command cannot be run.
     #[error("run {command:?}: {source}; install clearway, or name its command in the environment variable CLEARWAY")]
     Command {
-        /// The command.
+        /// Path or name of the command that was tried.
         command: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The server ended before readers could connect.
@@ -60,7 +60,7 @@ pub enum ReplayError {
     File {
         /// The folder or file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
 }

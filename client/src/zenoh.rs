@@ -37,7 +37,7 @@ mod subscription;
 use query::{LayerKey, failed};
 use subscription::LayerSubscription;
 
-/// Settings of every session. They override those of a configuration file.
+/// Settings of every session. They override the settings of a configuration file.
 const SETTINGS: [(&str, &str); 9] = [
     ("listen/endpoints", "[]"),
     ("scouting/multicast/enabled", "false"),
@@ -112,7 +112,7 @@ impl ZenohClient {
     }
 
     /// As [`ZenohClient::connect`], with these certificates, for `tls/HOST:PORT`. The name in the certificate of the
-    /// router must be that of the endpoint.
+    /// router must be the name in the endpoint.
     ///
     /// # Errors
     /// As [`ZenohClient::connect`].

@@ -91,7 +91,7 @@ fn map(numbers: &mut Numbers) -> Bytes {
     let mut encoded = encode_header(&v1::Header::default()).to_vec();
     for (name, geometry, rows, columns) in layers {
         let classes = blots(numbers, rows, columns);
-        // Reasons of which the last one is none that the clients know.
+        // Reasons; the clients do not know the last one.
         let reasons: Vec<u8> = (0..classes.len()).map(|_| (drawn.unit() * 10.0) as u8).collect();
         let channel =
             |name: &str, cells: &[u8]| encode_grid(CellsRef::U8(cells), columns).into_channel(name, "", 1.0, 0);

@@ -1,8 +1,8 @@
 //! Two versions of a layer -> a delta, which holds the changes between them: `Layer.base_sequence` of map.proto.
 //!
 //! In: the layer of an earlier map and the new layer, both whole. Out: the delta; [`crate::map::decode_map_on`] applies
-//! it. A channel whose changes are not smaller stays as in the whole layer. The CRC is that of the resulting cells, so
-//! a delta on a wrong base is refused and never gives a wrong cell.
+//! it. A channel whose changes are not smaller stays as in the whole layer. The CRC covers the resulting cells, so a
+//! delta on a wrong base is refused and never gives a wrong cell.
 
 use prost::Message;
 

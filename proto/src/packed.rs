@@ -1,6 +1,6 @@
 //! Numbers <-> packed lists, the bytes of a scan's fields: little-endian, one number after the other.
 //!
-//! The bytes are those of a packed `repeated float`, but they are copied as a whole instead of parsed number by number.
+//! The bytes equal a packed `repeated float`, but they are copied as a whole instead of parsed number by number.
 
 use bytes::Bytes;
 

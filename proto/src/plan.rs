@@ -16,7 +16,7 @@ pub enum PlanError {
     /// The bytes are not a plan.
     #[error("not a clearway.v1.Plan: {reason}")]
     Message {
-        /// The decoder's reason.
+        /// Error of the protobuf decoder.
         reason: String,
     },
     /// The plan is of another vehicle than its key states.
@@ -42,7 +42,7 @@ pub enum PlanError {
     /// A list does not have a number for each point of the path.
     #[error("{list} of {count} numbers: one for each of the {points} points is allowed")]
     List {
-        /// The list's field.
+        /// Field of the list, as in `clearway.v1.Plan`.
         list: &'static str,
         /// Number of numbers.
         count: usize,
@@ -58,11 +58,11 @@ pub enum PlanError {
     /// A number is NaN, infinite, or greater than any place on the Earth.
     #[error("{field}[{index}] is {value}: finite numbers up to 1e9 are allowed")]
     NotDrawable {
-        /// The field.
+        /// Field with the number, as in `clearway.v1.Plan`.
         field: &'static str,
         /// Index of the number.
         index: usize,
-        /// The number.
+        /// The number that cannot be drawn.
         value: f64,
     },
     /// The quaternion of `map_from_ego` has another length than 1.
@@ -74,9 +74,9 @@ pub enum PlanError {
     /// The name of the planner or the text is too long.
     #[error("{field} of {bytes} bytes: up to {bytes_max} are allowed")]
     Length {
-        /// The field.
+        /// Field with the text, as in `clearway.v1.Plan`.
         field: &'static str,
-        /// Its length in bytes.
+        /// Length of the text, in bytes.
         bytes: usize,
         /// Greatest length in bytes.
         bytes_max: usize,

@@ -35,7 +35,7 @@ pub enum RegionError {
         layer: String,
         /// The region as requested.
         region: v1::Region,
-        /// [`Grid::range_m_max`].
+        /// Distance to the layer's farthest cell, [`Grid::range_m_max`].
         range_m_max: f64,
     },
     /// The layer is not whole or is invalid.

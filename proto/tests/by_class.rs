@@ -81,7 +81,7 @@ fn the_golden_map_with_class_tables_equals_the_one_without() {
 fn a_channel_of_a_delta_has_a_class_table_if_that_is_shorter() {
     let (class, channels) = golden_channels();
     let before = bytes(&class, 40, &channels, true);
-    // The new classes have nothing to do with the old ones; the values of each class stay.
+    // The new classes have nothing to do with the old classes; the values of each class stay.
     let later: Vec<u8> = (0..1200).map(|cell: u32| (cell / 40 / 7 + cell % 40 / 9) as u8 % 4).collect();
     let of = |table: [u8; 4]| Cells::U8(later.iter().map(|class| table[usize::from(*class)]).collect());
     let after = [("hits", of([0, 3, 250, 255])), channels[1].clone(), channels[2].clone()];

@@ -34,7 +34,7 @@ fn bytes(bits: &str) -> Vec<u8> {
     bits.as_bytes().chunks(8).map(byte).collect()
 }
 
-/// Payloads of rows with another number of cells than `count`, and malformed ones.
+/// Payloads of rows with another number of cells than `count`, and malformed payloads.
 fn false_rows(count: u64) -> Vec<Vec<u8>> {
     let copy = |cells: u64| {
         let mut bits = String::new();

@@ -29,7 +29,7 @@ fn bytes(header: &v1::Header, layer: &v1::Layer) -> Bytes {
     [map::encode_header(header), map::encode_layer(layer)].concat().into()
 }
 
-/// Raw value of a cell of an endless grid at a time: patches, of which few change from one time to the next.
+/// Raw value of a cell of an endless grid at a time: patches; few change from one time to the next.
 fn world(seed: u64, time: u64, ix: i64, iy: i64) -> u16 {
     let hash = |a: i64, b: i64, c: u64| {
         let mut h =
@@ -374,7 +374,7 @@ fn a_radial_part_has_rows_to_the_farthest_corner_and_all_columns() {
     };
     assert_eq!(whole.layers[0].channels[0].cells, Cells::U8([&class[..], &rest(&whole, 48)].concat()));
     assert_eq!((&part.layers[0].planes, &part.layers[0].metrics), (&whole.layers[0].planes, &whole.layers[0].metrics));
-    // To the left, from the third row on: of 24 columns those from 45 to 135 degrees. The first two rows are unknown.
+    // To the left, from the third row on: the columns from 45 to 135 degrees. The first two rows are unknown.
     let left = v1::Region { x_from_m: -5.4, x_to_m: 5.4, y_from_m: 5.5, y_to_m: 7.0 };
     let part = decode(1, &region::crop(&rings, &left, &LIMITS()).unwrap(), None).unwrap();
     let Cells::U8(cut) = &part.layers[0].channels[0].cells else { panic!("class of u8") };

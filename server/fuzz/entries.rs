@@ -19,7 +19,7 @@ use clearway_replay::files::Readings;
 use clearway_replay::files::mcap::McapOptions;
 use prost::Message;
 
-/// An encoded observation.
+/// Decodes the bytes as an encoded observation.
 pub fn observation(bytes: &[u8]) {
     let Ok(observation) = v1::Observation::decode(Bytes::copy_from_slice(bytes)) else { return };
     let Ok(bodies) = decode(observation, &Limits::from_points_max(1000)) else { return };

@@ -93,7 +93,7 @@ impl Vehicle {
             let (halt, late_ns) = (halt.clone(), late_ns.clone());
             move || {
                 let vehicle = SimulatedVehicle::new(flat(), ScannerConfig::default());
-                // A packet is asked for when the one before it has been sent.
+                // A packet is asked for when the packet before it has been sent.
                 let mut least_ns = i64::MAX;
                 let packets = vehicle.filter(|datagram| datagram.payload.len() == 1206).inspect(move |datagram| {
                     let behind_ns = now_ns() - datagram.stamp_ns;

@@ -43,7 +43,7 @@ export class Feed {
     else this.#repaint();
   }
 
-  // Sends the selection: it is another one, or the connection is new.
+  // Sends the selection: the selection has changed, or the connection is new.
   begin() {
     if (!this.#want) return;
     const { layers, max_rate_hz, deltas } = this.#want;
@@ -52,7 +52,7 @@ export class Feed {
     this.#send({ type: "watch", id: this.#id, layers, max_rate_hz, deltas, max_in_flight: IN_FLIGHT_MAX });
   }
 
-  // The server has taken the selection with this id: the maps from now on are those of it.
+  // The server has taken the selection with this id: the maps from now on belong to it.
   begun(id) {
     if (id !== this.#id) return;
     this.#is_begun = true;
@@ -116,7 +116,7 @@ export class Feed {
     try {
       frame = newFrame(update.map, show, raster, this.#ranges);
     } catch (error) {
-      // A map of which a part is refused is not shown at all. It is acknowledged, so that the next one comes.
+      // A map with a refused part is not shown at all. It is acknowledged, so that the next one comes.
       this.#stream.counts.refused++;
       this.#send({ type: "acknowledge", id: update.id, sequence: update.map.header.sequence.toString() });
       this.#emit({ type: "refused", reason: `A map was refused: ${error.message}` });

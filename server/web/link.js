@@ -3,7 +3,7 @@
 // Server: WebSocket live (server/daemon/src/publish/page_live.rs).
 
 const PAUSE_MS_MIN = 250, PAUSE_MS_MAX = 5000;
-// The server sends a status every second, so four missing ones mean that the connection is lost.
+// The server sends a status every second, so four missing statuses mean that the connection is lost.
 const SILENCE_MS_MAX = 4500;
 
 export class Link {

@@ -30,7 +30,7 @@ let is_draw_scheduled = false, wall_minus_monotonic = Date.now() - performance.n
 let link = { phase: "connecting", text: "Connecting …" }, retry_at_ms = 0;
 let names = null;
 
-// Times of the Worker are those of this thread's clock, from the Unix epoch.
+// A time of the Worker, from the Unix epoch -> the same time on this thread's clock.
 const local = (absolute_ms) => absolute_ms - performance.timeOrigin;
 
 const FROM_WORKER = {
@@ -92,7 +92,7 @@ function draw() {
   const drawn = [...frames];
   frames.clear();
   for (const [vehicle, frame] of drawn) {
-    // The Worker sends the next frame after this, even if this one cannot be drawn.
+    // The Worker sends the next frame after this, even if this frame cannot be drawn.
     post({ type: "drawn", vehicle });
     if (view.name === null) fleet.frame(vehicle, frame);
     else if (vehicle === view.name) view.frame(frame);

@@ -62,7 +62,7 @@ export class MapStream {
     return this.#is_new_connection && last?.boot_id === header.boot_id && last.sequence === header.sequence;
   }
 
-  // True if the map follows those received so far. Counts the gap before it.
+  // True if the map follows the maps received so far. Counts the gap before it.
   #isNew({ map: { header }, skipped, left_out }) {
     const last = this.#last;
     if (!last) return true;

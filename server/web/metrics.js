@@ -92,7 +92,7 @@ export function writeServerMetrics(element, status) {
 
 const signed = (value, digits) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(digits)}`;
 
-/// Sources of elevations that are not those of the sensor.
+/// Sources that do not give the elevations of the sensor itself.
 const DOUBTFUL = ["nominal", "estimated", "unknown"];
 
 export function writeSensors(body, sensors) {

@@ -48,7 +48,7 @@ export function wantOf(settings, layers) {
   const base = known(settings.layer) ? settings.layer : layers[0];
   const overlays = settings.overlays.filter((name) => known(name) && name !== base);
   const wanted = [base, ...overlays];
-  // The layer with the road's cells, and the one with the safe points.
+  // The layer with the road's cells, and the layer with the safe points.
   if (settings.road) wanted.push("speed");
   if (settings.safe_points) wanted.push("safe_path");
   // The layers with planes, on which the view in 3-D puts all cells.

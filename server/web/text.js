@@ -58,7 +58,7 @@ export function bearing(azimuth) {
   return `${size}° ${degrees > 0 ? "left" : "right"}`;
 }
 
-// Writes a text only if it is another one: a browser lays out and paints what is written.
+// Writes a text only if it has changed: a browser lays out and paints what is written.
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

@@ -190,7 +190,7 @@ impl Setting {
         let (map_ms, maps) = timed(|| events.iter().map(is_map).filter(|is_map| *is_map).count());
         assert!(maps == 1 || round == 0, "{maps} maps of a revolution");
         let mut map = pipeline.newest_map().expect("a map").clone();
-        // A layer that another one is made from is in its map too.
+        // A layer that another layer is made from is in its map too.
         map.layers.retain(|layer| self.layers.contains(&layer.name));
         let (encode_ms, encoded) = timed(|| EncodedMap::new(&map, "car".into(), 1, 300));
         Cost {

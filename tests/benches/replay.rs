@@ -7,8 +7,8 @@
 //!
 //! Age: from the shifted stamp of the map (its `capture_end_ns`, or the stamp of the ROS message) to the reader's
 //! hands, with decoding for gRPC and zenoh; of the page, the age that it shows in each display frame. The drive is a
-//! simulated HDL-64E in the town unless one is given. The command is the one that the environment variable CLEARWAY
-//! names, else the one beside this bench in the target folder.
+//! simulated HDL-64E in the town unless one is given. The command is the file that the environment variable CLEARWAY
+//! names, else the file beside this bench in the target folder.
 
 #[path = "../tests/page/webdriver.rs"]
 #[allow(dead_code, reason = "the tests of the page use the rest")]

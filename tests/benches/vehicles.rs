@@ -5,11 +5,11 @@
 //!   cargo bench -p clearway-tests --bench vehicles -- --vehicles 4 --seconds 60 --cpus 0,1 --json
 //!
 //! The server runs in its own process, on the processors of `--cpus`; senders and readers run on the others. The
-//! datagrams are made beforehand, and every vehicle sends the same ones, each begun at another moment of a revolution.
-//! Age: from the moment at which a map's last packet is due to be sent to the reader's hands. Lost: datagrams that were
-//! sent and not received, dropped by the kernel or lost at the queue. Memory: growth of the server's resident set over
-//! that of a server without vehicles' data, divided by the number of vehicles. The last column says which threads the
-//! processor time of a map went to.
+//! datagrams are made beforehand, and every vehicle sends the same datagrams, each vehicle from another moment of a
+//! revolution. Age: from the moment at which a map's last packet is due to be sent to the reader's hands. Lost:
+//! datagrams that were sent and not received, dropped by the kernel or lost at the queue. Memory: growth of the
+//! server's resident set over the resident set without vehicles' data, divided by the number of vehicles. The last
+//! column says which threads the processor time of a map went to.
 
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
@@ -186,7 +186,7 @@ async fn counts(client: &Client) -> u64 {
     ledgers.map(|ledger| ledger.received).sum()
 }
 
-/// Ages in ms of the maps of a vehicle that come while they are measured, and the number of those that were skipped.
+/// Ages in ms of the maps of a vehicle that come while they are measured, and the number of maps that were skipped.
 /// Packets are sent `shift_ns` after their stamps.
 async fn read(client: Client, vehicle: String, shift_ns: i64, is_measured: &AtomicBool) -> (Vec<f64>, u64) {
     let layers = LAYERS.map(str::to_owned).to_vec();
@@ -217,7 +217,7 @@ async fn send_poses(client: Client, vehicle: String) {
     }
 }
 
-/// The server's process.
+/// A process of the server under test, with its addresses.
 struct Process {
     child: Child,
     grpc: String,

@@ -16,7 +16,7 @@ use mcap::records::op;
 /// Length of the record that ends the data of a file.
 const DATA_END_BYTES: usize = 13;
 
-/// A whole recording.
+/// A whole recording, from which damaged copies are made.
 pub struct Original {
     bytes: Arc<[u8]>,
     /// A hash of each message, in file order.
@@ -174,7 +174,7 @@ impl Original {
     }
 }
 
-/// A copy of a recording, one bit of which is changed at a time.
+/// A copy of a recording with one bit changed at a time.
 pub struct Copy {
     file: PathBuf,
 }

@@ -100,7 +100,7 @@ impl Machines {
         Self { own, server: server_binary(server), folder, processes: BTreeMap::new(), hub: Hub::start() }
     }
 
-    /// Adds a process, and ends the one of the same name.
+    /// Adds a process, and ends the process of the same name.
     pub fn add(&mut self, name: &str, process: Process) -> &mut Process {
         self.stop(&[name]);
         self.processes.entry(name.into()).or_insert(process)

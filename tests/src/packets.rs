@@ -21,7 +21,7 @@ pub fn packets(vehicle: SimulatedVehicle, length: Duration) -> Vec<Datagram> {
     data.take_while(|datagram| datagram.stamp_ns - first_ns < length.as_nanos() as i64).collect()
 }
 
-/// How much later than the first vehicle the one with this number begins: the revolutions end evenly spread.
+/// How much later than the first vehicle the vehicle with this number begins: the revolutions end evenly spread.
 pub fn later(number: usize, vehicles: usize) -> Duration {
     REVOLUTION.mul_f64(number as f64 / vehicles as f64)
 }

@@ -132,7 +132,7 @@ fn plain() -> [Vec<f32>; 3] {
 }
 
 /// The points of a scan as [`plain`]: 32 rings of rough ground, and walls here and there, another scan for each number.
-/// Its maps of `speed` are as long as those of a recorded drive.
+/// Its maps of `speed` are as long as a recorded drive's.
 fn rough(number: u64) -> [Vec<f32>; 3] {
     let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(number);
     let mut points: [Vec<f32>; 3] = Default::default();

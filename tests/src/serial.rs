@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// A group of tests of which one runs at a time.
+/// A group of tests that run one at a time.
 pub struct SerialGroup(Mutex<()>);
 
 /// A browser without a graphics card draws with all processors: beside a second one it answers a click after half a
@@ -12,7 +12,7 @@ pub static BROWSER: SerialGroup = SerialGroup(Mutex::new(()));
 pub static NAMESPACES: SerialGroup = SerialGroup(Mutex::new(()));
 /// Packages, images and their guides: each builds and unpacks a system.
 pub static PACKAGES: SerialGroup = SerialGroup(Mutex::new(()));
-/// The ports of the default configuration: the demo and a server without options use the same ones.
+/// The ports of the default configuration: the demo and a server without options use the same ports.
 pub static DEFAULT_PORTS: SerialGroup = SerialGroup(Mutex::new(()));
 
 impl SerialGroup {

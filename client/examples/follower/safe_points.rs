@@ -65,7 +65,7 @@ struct SafePoint {
 }
 
 impl Follower {
-    /// Replaces the safe points by those of a map with the layer `safe_path`.
+    /// Replaces the safe points by the points of a map with the layer `safe_path`.
     pub fn update(&mut self, map: &MapView) -> Result<(), ClientError> {
         let layer = map.layer("safe_path")?;
         self.ego = ego_pose(map).unwrap_or_default();
@@ -129,8 +129,8 @@ impl Follower {
         Move { curvature_per_m: 0.0, mps: 0.0, path_m }
     }
 
-    /// The point to aim at: of the places within the radii of the path's safe points that the vehicle can drive to on
-    /// an arc, the one nearest to the goal.
+    /// The point to aim at: the place nearest to the goal, within the radii of the path's safe points, that the vehicle
+    /// can drive to on an arc.
     fn find_aim(&self, path: &[usize], goal: Point, clearance_m: f64) -> Option<Point> {
         let places = path.iter().flat_map(|index| {
             let SafePoint { at, radius_m, .. } = self.points[*index];

@@ -1,8 +1,7 @@
 //! Maps with the layer `freespace` -> the next move, by the layer's answers alone.
 //!
-//! In: maps, a goal. Out: the next [`Move`]: of several arcs the one that comes nearest to the goal before anything
-//! forbids it. Low things forbid it too. The map answers for the whole vehicle, so the planner keeps no grid of its
-//! own.
+//! In: maps, a goal. Out: the next [`Move`]: the arc that comes nearest to the goal before anything forbids it. Low
+//! things forbid it too. The map answers for the whole vehicle, so the planner keeps no grid of its own.
 
 use clearway_client::{Along, ClientError, MapView, Outline, Path};
 
@@ -10,8 +9,8 @@ use super::motion::{BRAKE_MPS2, CURVATURE_MAX, MPS_MAX, Move, Point, distance, e
 
 /// Outline of the vehicle, a car with its reference point in the middle.
 const CAR: Outline = Outline { front_m: 2.2, rear_m: 2.2, width_m: 1.8 };
-/// Distance to keep to the front and to each side in metres, and greatest speed in m/s. The next is tried if there is
-/// no arc with the one before.
+/// Distance to keep to the front and to each side in metres, and greatest speed in m/s. The next pair is tried if there
+/// is no arc with the pair before.
 const MARGINS: [(f64, f64); 3] = [(0.6, MPS_MAX), (0.4, 3.0), (0.2, 1.0)];
 /// Number of arcs to each side of straight ahead.
 const ARCS: i32 = 20;

@@ -19,7 +19,7 @@ const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
 const CELL_M: f64 = 0.5;
 /// Radius of the planner's grid around the vehicle, in metres.
 const RANGE_M: f64 = 16.0;
-/// Distance from the centre of a disc to that of an obstacle's cell in metres (its radius and half a cell), and
+/// Distance from the centre of a disc to the centre of an obstacle's cell in metres (its radius and half a cell), and
 /// greatest speed in m/s. The second is tried if there is no path with the first.
 const CLEARANCES_M: [(f64, f64); 2] = [(1.5, MPS_MAX), (1.2, 1.0)];
 /// Radius around the first position in which unknown ground is assumed free, in metres: the sensor cannot measure it.

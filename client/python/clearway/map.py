@@ -141,8 +141,8 @@ class Map:
         return self.staleness(self._now_ns())
 
     def staleness(self, at_ns: int) -> str | None:
-        """Why the map must not be used at a time, in a sentence; `None` if it may be used. The sentences are those of
-        `Staleness` of the Rust client (`client/golden/staleness.json`)."""
+        """Why the map must not be used at a time, in a sentence; `None` if it may be used. `Staleness` of the
+        Rust client gives the same sentences (`client/golden/staleness.json`)."""
         valid_ns = self._valid_ns()
         ahead_ns = self.header.capture_end_ns - at_ns
         if ahead_ns > valid_ns:

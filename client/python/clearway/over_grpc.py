@@ -191,7 +191,7 @@ def _receive_maps(
     """Stores the map of every update and acknowledges it, in lockstep when it was handled. If a delta needs a map that
     is not here (an update was lost), it requests a keyframe. Maps not stored count as skipped, except those that the
     requested rate excluded."""
-    # That of the stream before, if this one is opened again.
+    # The newest map of the stream before, if this stream is opened again.
     base = slot.newest()
     is_requested, left_out = False, 0
     for update in updates:

@@ -147,7 +147,7 @@ def put(session: zenoh.Session, key: str, payload: bytes) -> None:
 
 
 def _replies(session: zenoh.Session, key: str) -> Iterator[zenoh.Sample]:
-    """Every reply of every peer: zenoh would otherwise select one, perhaps that of a peer that is no server."""
+    """Every reply of every peer: zenoh would otherwise select one, perhaps from a peer that is no server."""
     import zenoh
 
     every, none = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
@@ -356,7 +356,7 @@ class _ReplaySubscription:
         if error is not None:
             self._slot.end(ClearwayError("UNAVAILABLE", str(error)))
         elif ended and not was_told:
-            # Other threads store the maps. One that the link lost does not come.
+            # Other threads store the maps. A map that the link lost does not come.
             until = time.monotonic() + _LAST_MAP_S
             while not self._has(*last) and time.monotonic() < until:
                 time.sleep(0.005)

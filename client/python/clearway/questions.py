@@ -355,7 +355,7 @@ def _halves(steps: Any) -> Any:
 
 
 def _steps_down(free: np.ndarray, reach: int) -> np.ndarray:
-    """For each cell the number of cells up or down its column to the nearest one that is not free, at most `reach`.
+    """For each cell the number of cells up or down its column to the nearest cell that is not free, at most `reach`.
     Outside the grid nothing is free."""
     steps = np.where(free, reach, 0).astype(np.int64)
     for rows in (range(len(steps)), reversed(range(len(steps)))):

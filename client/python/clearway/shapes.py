@@ -1,8 +1,8 @@
 """The shapes that questions are about: polygons of ground, outlines of vehicles, paths.
 
 In: values in the ego frame (x forward, y left, metres, radians). Out: checked corners and poses. A value that is not
-finite, or a polygon that crosses itself, raises a `ClearwayError` with that value, and is never answered. The kinds of
-errors (`reason`) and the poses are those of the Rust client.
+finite, or a polygon that crosses itself, raises a `ClearwayError` with that value, and is never answered. The Rust
+client has the same kinds of errors (`reason`) and the same poses.
 """
 
 from __future__ import annotations

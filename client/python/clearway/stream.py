@@ -174,7 +174,7 @@ class LatestSlot:
         self._fresh: Map | None = None
         self._ended: ClearwayError | None = None
         self._closed = False
-        #: Replays that have reached their end, and those of them after which the iteration has stopped.
+        #: Number of replays that have ended, and number of them after which the iteration has stopped.
         self._replay_ends = self._replay_ends_seen = 0
         #: True if no map has come since a replay has ended.
         self._at_end = False
@@ -312,8 +312,8 @@ class LatestSlot:
         return self._newest is not None and self._seen != self._counters
 
     def store(self, m: Map, skipped: int | None, *, lost: int = 0, left_out: int = 0) -> bool:
-        """Stores a map as the newest, or counts it as passed over. Between it and the one before there are `skipped`
-        maps (`None`: those that the sequence skips), of which the link lost at most `lost`, and `left_out` maps that
+        """Stores a map as the newest, or counts it as passed over. Between it and the map before there are `skipped`
+        maps (`None`: as many as the sequence skips), at most `lost` of them lost by the link, and `left_out` maps that
         the requested rate excluded. Returns whether it is stored. For the background thread."""
         m.with_arrival(self._clock)
         with self._changed:

@@ -98,7 +98,7 @@ class Replay:
         self.zenoh: str | None = next((f"zenoh:{endpoint}" for endpoint in addresses["zenoh"]), None)
 
     def watch(self, **selection: Any) -> clearway.MapStream:
-        """Streams the newest map; the arguments are those of `clearway.watch`."""
+        """Streams the newest map; it has the arguments of `clearway.watch`."""
         return clearway.watch(self.grpc, **selection)
 
     def state(self) -> ReplayState:
@@ -121,7 +121,7 @@ class Replay:
 
     def seek(self, seconds: float) -> ReplayState:
         """Goes to a time after the first event; the newest map of that moment is published at once. A paused replay
-        stays paused there, one that has ended plays on."""
+        stays paused there, a finished replay plays on."""
         if not abs(seconds) < _SEEK_S_MAX:
             text = f"seek {seconds} s: a number under {_SEEK_S_MAX:.0e} is allowed"
             raise clearway.ClearwayError("INVALID_ARGUMENT", text)

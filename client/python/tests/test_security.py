@@ -1,5 +1,5 @@
 """Certificates, against a running server that asks for them: CLEARWAY_SECURED_GRPC, behind a router that does too:
-CLEARWAY_SECURED_ZENOH, and their CA's folder CLEARWAY_CERTIFICATES, beside which lies that of another CA."""
+CLEARWAY_SECURED_ZENOH, and their CA's folder CLEARWAY_CERTIFICATES, beside the folder of another CA."""
 
 import os
 import time

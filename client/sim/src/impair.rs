@@ -1,7 +1,7 @@
 //! A bad network between sensor and server.
 //!
-//! In: datagrams in the order in which the sensor sent them. Out: those that arrive, in the order and with the stamps
-//! of their arrival, and [`Counts`] of the faults. The same seed gives the same faults.
+//! In: datagrams in the order in which the sensor sent them. Out: the datagrams that arrive, in the order and with the
+//! stamps of their arrival, and [`Counts`] of the faults. The same seed gives the same faults.
 
 use std::collections::BTreeMap;
 
@@ -36,7 +36,7 @@ pub struct Faults {
 pub struct Counts {
     /// Datagrams that were sent.
     pub sent: u64,
-    /// Datagrams that arrived, copies among them.
+    /// Number of datagrams that arrived, with copies.
     pub arrived: u64,
     /// Data packets lost, in bursts or alone.
     pub packets_lost: u64,
@@ -77,7 +77,7 @@ impl Impairment {
         Self { faults, counts, packets: 0, burst_left: 0, in_gap: false, under_way, arrived, newest_ns: i64::MIN }
     }
 
-    /// Sends a datagram; returns those that arrive before the next one is sent.
+    /// Sends a datagram; returns the datagrams that arrive before the next is sent.
     pub fn push(&mut self, datagram: Datagram) -> std::vec::Drain<'_, Datagram> {
         self.counts.sent += 1;
         let stamp_ns = datagram.stamp_ns;

@@ -23,8 +23,8 @@
 //! | [`telemetry`] (`sensor/`) | place, speed, time -> telemetry datagrams of 512 bytes |
 //! | [`traffic`] | six units of a few planes on a car in traffic, and the ground that each object covers |
 //! | [`vehicle`] | a scene and a sensor -> an endless stream of datagrams |
-//! | [`real_time`] | a vehicle and a clock -> its datagrams, without those that a slow machine skips |
-//! | [`impair`] | datagrams -> those that arrive through a bad network |
+//! | [`real_time`] | a vehicle and a clock -> its datagrams, except datagrams that a slow machine skips |
+//! | [`impair`] | datagrams -> the datagrams that arrive through a bad network |
 //! | [`send`] | datagrams -> UDP, paced by the clock |
 //! | [`noise`] | key -> random number |
 

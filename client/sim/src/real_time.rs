@@ -1,9 +1,8 @@
 //! A simulated vehicle in real time, on a machine that may be too slow for it.
 //!
 //! In: a vehicle whose stamps are times of a clock, that clock, and how far the server has come. Out: the vehicle's
-//! datagrams, without whole revolutions that are skipped, and not simulated, when the vehicle or the server is
-//! late. So the age of the maps stays bounded. Between two skips the datagrams are those that the vehicle gives by
-//! itself.
+//! datagrams, without whole revolutions that are skipped, and not simulated, when the vehicle or the server is late. So
+//! the age of the maps stays bounded. Between two skips the datagrams equal the vehicle's own.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

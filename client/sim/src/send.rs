@@ -17,7 +17,7 @@ pub enum Pace {
     RealTime,
     /// This many times as fast as the clock; above 0.
     Times(f64),
-    /// Without waiting.
+    /// As fast as datagrams can be sent, without waiting for their stamps.
     AsFastAsPossible,
 }
 
@@ -35,7 +35,7 @@ pub struct Until<'a> {
 pub struct Sent {
     /// Number of data packets.
     pub packets: u64,
-    /// Telemetry datagrams.
+    /// Number of telemetry datagrams.
     pub telemetry: u64,
     /// Answers of the data target's machine that no socket is open there.
     pub refused: u64,

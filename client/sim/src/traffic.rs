@@ -96,7 +96,7 @@ pub fn scans_of_six_units() -> Vec<([Vec<f32>; 3], [f32; 3])> {
 pub struct Footprints(Vec<(Kind, Shape)>);
 
 impl Footprints {
-    /// The objects of a world at `time` s, without those that hang over the ground and those too thin to cover any.
+    /// The objects of a world at `time` s, without objects that hang over the ground or are too thin to cover any.
     pub fn at(world: &World, time: f64) -> Self {
         let shapes = world.objects.iter().map(|object| (object.kind, object.at(time, &world.ground)));
         Self(shapes.filter(|(kind, _)| !matches!(kind, Kind::Leaves | Kind::Beam | Kind::Fence)).collect())

@@ -36,7 +36,7 @@ pub struct Datagram {
     pub stamp_ns: i64,
     /// Data packet or telemetry.
     pub kind: Kind,
-    /// UDP payload.
+    /// Payload of the UDP datagram, without headers.
     pub payload: Vec<u8>,
 }
 
@@ -96,7 +96,7 @@ impl SimulatedVehicle {
         &self.scene
     }
 
-    /// The vehicle's sensor.
+    /// The LIDAR on the vehicle.
     pub fn scanner(&self) -> &Scanner {
         &self.scanner
     }
@@ -187,7 +187,7 @@ impl SimulatedVehicle {
         }
         let firings = revolutions * revolution_ns / self.scanner.firing_ns(1) as f64;
         let before = self.next_firing;
-        // One packet after the first one that begins no earlier than this angle: that may still hold the end.
+        // One packet after the first packet that begins no earlier than this angle: it may still hold the end.
         self.move_to(before + firings as i64 + 2 * self.firings_per_packet());
         let skipped_ns = self.scanner.firing_ns(self.next_firing - before);
         Duration::from_nanos(skipped_ns.unsigned_abs())
@@ -219,8 +219,8 @@ impl SimulatedVehicle {
         TrueRevolution { revolution, map_from_ego, truth }
     }
 
-    /// Revolution `number`, whole, through real datagrams and the decoder: the one whose middle is the encoder's zero,
-    /// ahead of the vehicle, at time `number * 60 / rpm`.
+    /// Revolution `number`, whole, through real datagrams and the decoder: the revolution whose middle is the encoder's
+    /// zero, ahead of the vehicle, at time `number * 60 / rpm`.
     ///
     /// # Panics
     /// As [`SimulatedVehicle::true_revolution`].
@@ -234,7 +234,7 @@ impl SimulatedVehicle {
         };
         let mut sensor = Sensor::new(config);
         // The decoder ends revolutions behind the vehicle, half a revolution before the encoder's zero. A firing whose
-        // angle rounds to that one begins a revolution one firing early.
+        // angle rounds to that angle begins a revolution one firing early.
         let half_revolution_ns = (30e9 / self.scanner.config().rpm) as i64;
         let slack_ns = self.scanner.firing_ns(2);
         let begins_ns = self.start_ns + self.scanner.firing_ns(self.scanner.first_firing_of(number))

@@ -1,4 +1,4 @@
-//! Streams through a bad network: what the decoder makes of them, beside what it makes of the clean ones.
+//! Streams through a bad network: what the decoder makes of them, beside what it makes of clean streams.
 
 use clearway_lidar::model::{Model, ReturnMode};
 use clearway_lidar::revolution::Revolution;

@@ -71,7 +71,7 @@ fn halves(steps: u32) -> u64 {
     halves * halves
 }
 
-/// For each cell the number of cells up or down its column to the nearest one that is not free, at most `reach`.
+/// For each cell the number of cells up or down its column to the nearest cell that is not free, at most `reach`.
 fn steps_down(width: usize, height: usize, reach: u32, is_free: impl Fn(usize) -> bool) -> Vec<u32> {
     let mut steps: Vec<u32> = (0..width * height).map(|cell| if is_free(cell) { reach } else { 0 }).collect();
     for column in 0..width {

@@ -190,7 +190,7 @@ impl MapView {
     }
 }
 
-/// The answer for a polygon; of several cells that forbid it, the one nearest to `from` is named.
+/// The answer for a polygon; of several cells that forbid it, the cell nearest to `from` is named.
 fn answer(layer: &Layer, kinds: &[ClassKind], corners: &[[f64; 2]], from: [f64; 2]) -> Answer {
     let Touched { cells, outside } = touched(&layer.grid, corners);
     let nearest = |wanted: ClassKind| {

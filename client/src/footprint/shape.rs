@@ -23,13 +23,13 @@ pub enum ShapeError {
     NotFinite {
         /// The value's name, such as `corner 2, y`.
         what: String,
-        /// The value.
+        /// The value that is NaN or infinite.
         value: f64,
     },
     /// A length is negative, or a path is too long.
     #[error("{what} is {value} m; {allowed} m is allowed")]
     Length {
-        /// The value's name.
+        /// Name of the value, such as `front_m`.
         what: &'static str,
         /// The value, in metres.
         value: f64,
@@ -43,7 +43,7 @@ pub enum ShapeError {
         what: &'static str,
         /// Number of different places.
         number: usize,
-        /// Least number.
+        /// Least number of different places that is needed.
         least: usize,
     },
     /// Two edges of a polygon cross.
@@ -54,7 +54,7 @@ pub enum ShapeError {
     Crossing {
         /// The edges, by the number of their first corner.
         edges: [usize; 2],
-        /// Where they cross, in metres.
+        /// Point at which the edges cross, in metres.
         at_m: [f64; 2],
     },
 }
@@ -143,7 +143,7 @@ pub struct Outline {
     pub front_m: f64,
     /// Distance from the reference point to the rear.
     pub rear_m: f64,
-    /// Width.
+    /// Width of the outline; half of it lies on each side of the reference point.
     pub width_m: f64,
 }
 
@@ -193,8 +193,8 @@ pub(super) struct PathPose {
 }
 
 impl Path {
-    /// Poses of a vehicle, each at most [`STEP_M`] from the one before and turned by so little that its farthest corner
-    /// moves at most as far by that; with both ends.
+    /// Poses of a vehicle, each at most [`STEP_M`] from the pose before and turned by so little that its farthest
+    /// corner moves at most as far by that; with both ends.
     pub(super) fn poses(&self, outline: &Outline) -> Result<Vec<PathPose>, ShapeError> {
         match self {
             Self::Places(given) => straight_poses(given, outline.reach_m()),
@@ -292,7 +292,7 @@ fn path_length(what: &'static str, value: f64) -> Result<(), ShapeError> {
     if value <= PATH_M_MAX { Ok(()) } else { Err(ShapeError::Length { what, value, allowed }) }
 }
 
-/// The places without those that repeat the place before.
+/// The places, without places that repeat the place before.
 fn places(what: &'static str, given: &[[f64; 2]], one: &str, least: usize) -> Result<Vec<[f64; 2]>, ShapeError> {
     for (index, place) in given.iter().enumerate() {
         for (axis, value) in ["x", "y"].into_iter().zip(place) {

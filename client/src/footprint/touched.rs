@@ -1,8 +1,8 @@
 //! The cells that a polygon touches.
 //!
-//! In: a grid and the corners of a simple polygon in the ego frame (metres). Out: every cell of which the polygon, its
-//! border included, touches a point, and whether it reaches outside the grid. A cell is touched by an edge, or lies
-//! wholly inside; then the line through its centre crosses the polygon there. `client/python` has the same arithmetic.
+//! In: a grid and the corners of a simple polygon in the ego frame (metres). Out: every cell that the polygon, its
+//! border included, touches, and whether it reaches outside the grid. A cell is touched by an edge, or lies wholly
+//! inside; then the line through its centre crosses the polygon there. `client/python` has the same arithmetic.
 
 use std::f64::consts::TAU;
 

@@ -13,7 +13,7 @@ use crate::view::MapView;
 
 use super::refusal::refused;
 
-/// Shortest and longest pause before a stream is opened again; each is twice the one before. Ours: a restart of a
+/// Shortest and longest pause before a stream is opened again; each is twice the pause before. Ours: a restart of a
 /// server costs a map, and a server that is away gets few requests.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
 

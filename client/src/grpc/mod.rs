@@ -243,8 +243,8 @@ impl Client {
         Ok(updates.map(|updates| (updates.into_inner(), acknowledge)))
     }
 
-    /// The server to which this one leads: it serves the vehicle that this one does not. With the certificates of this
-    /// connection.
+    /// The server to which this server leads: it serves the vehicle that this server does not. With the certificates of
+    /// this connection.
     async fn led_by(&self, status: Option<&Status>) -> Result<Option<Self>, ClientError> {
         let address = status.and_then(|status| status.metadata().get(SERVED_AT)?.to_str().ok());
         match address {

@@ -98,7 +98,7 @@ impl LayerKey {
     /// [`ClientError::Zenoh`] if the query fails, [`ClientError::Map`] if there are replies and none is a valid map.
     pub async fn newest(&self, session: &Session) -> Result<Option<MapView>, ClientError> {
         let query = session.get(&self.key).timeout(QUERY_TIMEOUT);
-        // Every reply of every peer: zenoh would otherwise select one, perhaps that of a peer that is no server.
+        // Every reply of every peer: zenoh would otherwise select one, perhaps the reply of a peer that is no server.
         let query = query.target(QueryTarget::All).consolidation(ConsolidationMode::None);
         let replies = query.await.map_err(failed(format!("get {}", self.key)))?;
         let (mut newest, mut wrong) = (None::<MapView>, None);

@@ -12,8 +12,8 @@ use crate::error::ClientError;
 use crate::stream::LatestSlot;
 use crate::zenoh::query::{QUERY_TIMEOUT, failed};
 
-/// Tells the slot of every end of the vehicle's replay while the subscriber lives, and of one that was before. zenoh
-/// calls back in the order in which the server puts, so that the last map comes before the end.
+/// Tells the slot of every end of the vehicle's replay while the subscriber lives, and of an end before. zenoh calls
+/// back in the order in which the server puts, so that the last map comes before the end.
 ///
 /// # Errors
 /// [`ClientError::Zenoh`] if the subscription or the query fails.
@@ -48,7 +48,7 @@ struct Ends {
 }
 
 impl Ends {
-    /// Reads a message of the key; one that is not of its form is passed over.
+    /// Reads a message of the key; a message of another form is ignored.
     fn read(&self, sample: &Sample) {
         let Ok(document) = serde_json::from_slice::<Value>(&sample.payload().to_bytes()) else { return };
         let Some(ended) = document["ended"].as_bool() else { return };

@@ -1,13 +1,13 @@
 //! Samples of one layer's key -> the newest map, with the numbers of missed maps.
 //!
 //! The publisher's cache gives the current map to a new subscriber, and again after a lost connection is restored. Lost
-//! maps are not recovered: an old map has no use, and zenoh would delay the newest one until the lost ones had arrived.
+//! maps are not recovered: an old map has no use, and zenoh would delay the newest map until the lost maps had arrived.
 //! Only if the last map is lost, no newer sample follows that shows the loss. Then the publisher's heartbeat states its
 //! number, and this file queries it.
 //!
 //! Callbacks check and decode each sample, and store its map in a slot of one: from zenoh's queue of 256 a slow planner
 //! would get maps that are seconds old. What does not belong on the key is counted and takes no map's place. Gaps in
-//! the maps' sequence numbers are skipped maps; those among them that zenoh missed are lost maps.
+//! the maps' sequence numbers are skipped maps; skipped maps that zenoh missed are lost maps.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};

@@ -130,7 +130,7 @@ function checkLengths(bits, count, error) {
   if (at !== count) throw error("cells", `the payload has ${at} cells, not ${count}`);
 }
 
-// Encoding ROWS: alternately cells equal to those one row before, and a run of one other value.
+// Encoding ROWS: alternately cells equal to the cells one row before, and a run of one other value.
 function readRows(bits, cells, columns) {
   const signed = cells instanceof Int8Array;
   for (let at = 0; at < cells.length; ) {

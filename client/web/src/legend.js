@@ -24,6 +24,6 @@ export function readLegend({ name: layer, legend: names, legend_meanings: meanin
   });
 }
 
-// True if a delta leaves out its legend, which is then that of its base.
+// True if a delta leaves out its legend, which then equals the legend of its base.
 export const isWithoutLegend = ({ legend, legend_meanings, legend_rgb }) =>
   legend.length + legend_meanings.length + legend_rgb.length === 0;

@@ -1,5 +1,5 @@
-// The limits of what the page accepts, checked before anything is allocated. They are those of the Rust and the Python
-// decoder: a test compares them with proto/golden/limits.json.
+// The limits of what the page accepts, checked before anything is allocated. The Rust and the Python decoder have the
+// same limits: a test compares them with proto/golden/limits.json.
 
 // Cells of one channel.
 export const CHANNEL_CELLS_MAX = 4 << 20;

@@ -17,7 +17,7 @@ export function openUpdate(message, base = null) {
   return { ...update, map: new LiveMap(update.map, base) };
 }
 
-// A map of which only the header and the layers' names are read at first.
+// A map; at first only its header and the layers' names are read.
 export class LiveMap {
   // By name: a Layer message, or its bytes.
   #sources = new Map();
@@ -26,7 +26,7 @@ export class LiveMap {
 
   // map: an encoded Map, or a Map message with the field names of map.proto, 64-bit numbers as BigInt and bytes as
   // Uint8Array. base: the map that deltas start from, or null. With a base every layer is opened at once, so that no
-  // map keeps another one.
+  // map keeps another map.
   constructor(map, base = null) {
     const is_encoded = ArrayBuffer.isView(map);
     this.length = is_encoded ? map.length : 0;

@@ -191,8 +191,8 @@ export const readMapUpdate = (from) => decode(MAP_UPDATE, from);
 export const readLayer = (from) => decode(LAYER, from);
 export const readLayerName = (from) => decode({ 1: ["name", string] }, from).name;
 
-// How many layers, channels, planes, sensors and names an encoded Map claims to have, counted before any is made: its
-// length-delimited fields, and those of its header and of its layers.
+// How many layers, channels, planes, sensors and names an encoded Map claims to have, counted before any is made: the
+// length-delimited fields of the map, of its header and of its layers.
 export function countParts(map) {
   let parts = 0;
   for (const [number, content] of chunks(map)) {

@@ -20,7 +20,7 @@ pub enum MessageError {
     /// The message ends before a member does.
     #[error("{what} needs {needed} bytes at {at}, but the message has {length}")]
     Truncated {
-        /// The member.
+        /// Name of the member at which the message ends.
         what: &'static str,
         /// Bytes that the member needs.
         needed: usize,
@@ -32,17 +32,17 @@ pub enum MessageError {
     /// A text is not UTF-8, or does not end in its only zero.
     #[error("{what} is not UTF-8 ending in its only zero")]
     Text {
-        /// The member.
+        /// Name of the member with the text.
         what: &'static str,
     },
     /// The value of a member is not allowed.
     #[error("{what} = {value}: allowed: {allowed}")]
     Value {
-        /// The member.
+        /// Name of the member with the value.
         what: &'static str,
-        /// The value found.
+        /// The refused value, as text.
         value: String,
-        /// The values allowed.
+        /// The values that are allowed, in words.
         allowed: &'static str,
     },
 }
@@ -71,11 +71,11 @@ pub struct RefusedPart {
     pub what: &'static str,
     /// Number of points, transforms or packets; 1 for a field.
     pub count: u64,
-    /// The first fault.
+    /// The first of the faults in this part.
     pub fault: MessageError,
 }
 
-/// `std_msgs/Header`.
+/// A `std_msgs/Header`, borrowed from the message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header<'a> {
     /// Time of the data, ns since the Unix epoch.
@@ -222,7 +222,7 @@ impl Default for Writer {
 }
 
 impl Writer {
-    /// Returns the message.
+    /// Returns the bytes of the message, with its CDR header.
     pub fn finish(self) -> Vec<u8> {
         self.message
     }
@@ -267,7 +267,7 @@ impl Writer {
         self.u32(seconds.cast_unsigned()).u32(stamp_ns.rem_euclid(1_000_000_000) as u32)
     }
 
-    /// Writes a `std_msgs/Header`.
+    /// Appends the members of a `std_msgs/Header`: the stamp, then the frame.
     pub fn header(&mut self, header: &Header) -> &mut Self {
         self.stamp(header.stamp_ns).text(header.frame_id)
     }

@@ -3,20 +3,20 @@
 /// The message types that are read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
-    /// `velodyne_msgs/msg/VelodyneScan`.
+    /// `velodyne_msgs/msg/VelodyneScan`: the data packets of a scan.
     VelodyneScan,
-    /// `sensor_msgs/msg/PointCloud2`.
+    /// `sensor_msgs/msg/PointCloud2`: points with named fields.
     PointCloud2,
-    /// `nav_msgs/msg/Odometry`.
+    /// `nav_msgs/msg/Odometry`: a pose with velocities.
     Odometry,
-    /// `geometry_msgs/msg/PoseStamped`.
+    /// `geometry_msgs/msg/PoseStamped`: a pose with its frame and stamp.
     PoseStamped,
-    /// `tf2_msgs/msg/TFMessage`.
+    /// `tf2_msgs/msg/TFMessage`: transforms between frames.
     TfMessage,
 }
 
 impl Kind {
-    /// All kinds.
+    /// All kinds, in the order of the enum.
     pub const ALL: [Self; 5] =
         [Self::VelodyneScan, Self::PointCloud2, Self::Odometry, Self::PoseStamped, Self::TfMessage];
 

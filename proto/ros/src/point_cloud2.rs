@@ -35,7 +35,7 @@ pub struct PointCloud2<'a> {
     pub dense: bool,
 }
 
-/// `sensor_msgs/PointField`.
+/// A `sensor_msgs/PointField`: where a number lies in the bytes of a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Field<'a> {
     /// Name, such as `x` or `intensity`.

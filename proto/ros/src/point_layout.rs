@@ -9,7 +9,7 @@ const INTENSITIES: &[&str] = &["intensity", "reflectivity"];
 const RINGS: &[&str] = &["ring", "channel", "laser_id", "line"];
 const TIMES: &[&str] = &["time", "t", "timestamp", "time_stamp", "offset_time"];
 
-/// The fields of a point that are read. None of them overlaps another one.
+/// The fields of a point that are read. None of them overlaps another field.
 pub(crate) struct Layout {
     pub position: [FieldReader; 3],
     pub intensity: Option<FieldReader>,
@@ -18,7 +18,7 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    /// Finds the fields; appends the optional ones that cannot be read to `refused`.
+    /// Finds the fields; appends the optional fields that cannot be read to `refused`.
     pub fn from_cloud(cloud: &PointCloud2, refused: &mut Vec<RefusedPart>) -> Result<Self, MessageError> {
         let mut used = Vec::new();
         let mut position = [FieldReader { offset: 0, datatype: Datatype::Float32, big_endian: false }; 3];

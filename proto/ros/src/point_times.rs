@@ -15,7 +15,7 @@ const POINTS_PER_NS_MAX: f64 = 0.05;
 /// Least span of the times of a cloud, ns. Ours: the packets of nearly all sensors last longer, and times in ms that
 /// are read as µs are below it.
 const SPAN_NS_MIN: i64 = 300_000;
-/// Least number of points of which the rate and the span are judged.
+/// Least number of points whose rate and span are judged.
 const RATED_POINTS: usize = 100;
 /// Units a second: seconds, ms, µs, ns.
 const UNITS: [f64; 4] = [1.0, 1e3, 1e6, 1e9];

@@ -34,7 +34,7 @@ pub struct Odometry<'a> {
     pub twist: Option<Twist>,
 }
 
-/// `geometry_msgs/msg/Twist`.
+/// A `geometry_msgs/msg/Twist`: linear and angular velocity.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Twist {
     /// Linear velocity in the child's frame, m/s.
@@ -55,7 +55,7 @@ pub struct TfMessage<'a> {
 /// A transform of a `tf2_msgs/msg/TFMessage` that was refused.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RefusedTransform<'a> {
-    /// Child frame.
+    /// Child frame of the transform.
     pub child_frame_id: &'a str,
     /// The fault, with the child frame.
     pub fault: MessageError,
@@ -172,7 +172,7 @@ pub fn path_to_cdr(header: &Header, poses: &[Isometry3<f64>]) -> Vec<u8> {
     writer.finish()
 }
 
-/// Reads a `geometry_msgs/Pose`.
+/// Reads a `geometry_msgs/Pose`, named `what` in errors.
 fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, MessageError> {
     isometry(reader.f64s(what)?, what)
 }

@@ -1,4 +1,4 @@
-//! Messages written by rosbags are read correctly, and messages written here equal those of rosbags.
+//! Messages written by rosbags are read correctly, and messages written here equal messages of rosbags.
 
 use clearway_ros::cdr::Header;
 use clearway_ros::pose::{

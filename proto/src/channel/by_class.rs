@@ -31,7 +31,7 @@ pub enum ByClassError {
     /// A channel with a class table has another encoding than changes.
     #[error("encoding {encoding}; 3 (changes) is needed")]
     Encoding {
-        /// `Channel.encoding`.
+        /// The value of `Channel.encoding`.
         encoding: i32,
     },
     /// The class table does not have one cell per class.

@@ -27,7 +27,7 @@ pub enum Cells {
 }
 
 impl Cells {
-    /// Borrows the values.
+    /// Borrows the cells without a copy.
     pub fn as_ref(&self) -> CellsRef<'_> {
         match self {
             Self::U8(cells) => CellsRef::U8(cells),

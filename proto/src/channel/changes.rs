@@ -1,7 +1,7 @@
 //! Cells <-> bits, as differences from a base: `ENCODING_CHANGES` of map.proto.
 //!
-//! In: cells, and a base of as many cells: those of an earlier map ([`crate::delta`]) or the usual value of each cell's
-//! class ([`crate::by_class`]). Out: bits.
+//! In: cells, and a base of as many cells: the cells of an earlier map ([`crate::delta`]) or the usual value of each
+//! cell's class ([`crate::by_class`]). Out: bits.
 //!
 //! Changes occur along borders between patches and continue from cell to cell. So each cell has a context (which of its
 //! neighbours have changed, and which have another value in the base), and each context has its own runs of unchanged
@@ -137,7 +137,7 @@ struct Run {
 /// Collects the pieces of a payload in the order in which a decoder needs them. A run grows after it was started.
 struct RunWriter {
     tokens: Vec<Token>,
-    /// By context.
+    /// The newest run of each context, by index of the context.
     newest: [Run; CONTEXTS],
 }
 

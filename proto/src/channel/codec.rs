@@ -41,8 +41,7 @@ pub struct Encoded {
 }
 
 impl Encoded {
-    /// The channel message. A cell's value in `unit` is `raw * scale`; `unknown` is the raw value of a cell of which
-    /// nothing is known.
+    /// The channel message. A cell's value in `unit` is `raw * scale`; `unknown` is the raw value of an unknown cell.
     pub fn into_channel(self, name: &str, unit: &str, scale: f32, unknown: i32) -> v1::Channel {
         v1::Channel {
             name: name.into(),
@@ -97,9 +96,9 @@ pub(crate) fn encode_smallest(cells: CellsRef<'_>, columns: usize, changes: Opti
 ///
 /// # Errors
 /// Names the first fault found: [`DecodeError::TooManyCells`] if the count is over the limit,
-/// [`DecodeError::NothingToChange`] if the payload holds changes, [`DecodeError::Crc`] if the cells are not those that
-/// were encoded, and the other variants if the payload is malformed or not canonical. A raw payload is accepted even if
-/// rows would be smaller.
+/// [`DecodeError::NothingToChange`] if the payload holds changes, [`DecodeError::Crc`] if the cells differ from the
+/// encoded cells, and the other variants if the payload is malformed or not canonical. A raw payload is accepted even
+/// if rows would be smaller.
 pub fn decode(channel: &v1::Channel, columns: usize, limits: &Limits) -> Result<Cells, DecodeError> {
     check_count(channel, limits)?;
     decode_on(channel, columns, None)

@@ -6,21 +6,21 @@ pub enum DecodeError {
     /// The channel claims more cells than the reader accepts.
     #[error("{cell_count} cells; at most {allowed} are allowed")]
     TooManyCells {
-        /// `Channel.cell_count`.
+        /// Number of cells in `Channel.cell_count`.
         cell_count: u32,
-        /// [`crate::limits::Limits::channel_cells`].
+        /// Greatest number, [`crate::limits::Limits::channel_cells`].
         allowed: u32,
     },
     /// The cell type does not exist.
     #[error("cell type {value}; 1 (u8), 2 (i8) and 3 (u16) exist")]
     CellType {
-        /// `Channel.cell_type`.
+        /// The value of `Channel.cell_type`.
         value: i32,
     },
     /// The encoding does not exist.
     #[error("encoding {value}; 1 (raw), 2 (rows) and 3 (changes) exist")]
     Encoding {
-        /// `Channel.encoding`.
+        /// The value of `Channel.encoding`.
         value: i32,
     },
     /// A raw payload has another length than its cells.
@@ -28,7 +28,7 @@ pub enum DecodeError {
     RawLength {
         /// Bytes of the payload.
         length: usize,
-        /// `Channel.cell_count`.
+        /// Number of cells in `Channel.cell_count`.
         cell_count: u32,
         /// Bytes of so many cells.
         expected: u64,
@@ -101,7 +101,7 @@ pub enum DecodeError {
     /// The decoded cells have another CRC than the channel states.
     #[error("CRC-32 of the cells is {computed:08x}; the channel states {stated:08x}")]
     Crc {
-        /// `Channel.crc32`.
+        /// The CRC-32 in `Channel.crc32`.
         stated: u32,
         /// CRC-32 of the decoded cells.
         computed: u32,

@@ -79,7 +79,7 @@ pub(crate) fn decode_rows<T: Cell>(payload: &[u8], count: usize, columns: usize)
             _ if repeats_before => return Err(DecodeError::NothingBefore { offset }),
             _ => bits.read_cell(None)?,
         };
-        // Canonical: the value is not that of the row before (a copy), of the cell before (the bit), or of the last
+        // Canonical: the value differs from the row before (a copy), from the cell before (the bit) and from the last
         // run.
         if value == above(&cells) || (!repeats_before && before == Some(value)) || run == Some(value) {
             return Err(repeated(value));

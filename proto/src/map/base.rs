@@ -37,7 +37,7 @@ pub(crate) struct Shift<'a> {
 }
 
 impl<'a> Shift<'a> {
-    /// Compares a grid with that of its base layer. Refuses grids whose cells are not comparable.
+    /// Compares a grid with the grid of its base layer. Refuses grids whose cells are not comparable.
     pub(crate) fn new(base: &'a Layer, grid: &Grid) -> Result<Self, BaseError> {
         let by = match (&base.grid, grid) {
             (

@@ -1,6 +1,6 @@
 //! Why a delta does not fit its base layer.
 
-/// Why the cells of a delta cannot be compared with those of its base layer.
+/// Why the cells of a delta cannot be compared with the cells of its base layer.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum BaseError {
     /// One grid is radial and the other is Cartesian.

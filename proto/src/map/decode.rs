@@ -1,7 +1,7 @@
 //! The bytes of a map <-> checked values.
 //!
-//! Protobuf messages concatenate: the bytes of a header followed by those of any selection of layers are the bytes of
-//! the map with these layers. So a server encodes each part once ([`encode_header`], [`encode_layer`]).
+//! Protobuf messages concatenate: the bytes of a header followed by the bytes of any selection of layers are the bytes
+//! of the map with these layers. So a server encodes each part once ([`encode_header`], [`encode_layer`]).
 
 use bytes::Bytes;
 use prost::Message;
@@ -24,7 +24,7 @@ pub fn encode_header(header: &v1::Header) -> Bytes {
     v1::Map { header: Some(header.clone()), layers: Vec::new() }.encode_to_vec().into()
 }
 
-/// The bytes that, appended to those of a header, add this layer to the map.
+/// The bytes that, appended to a header's bytes, add this layer to the map.
 pub fn encode_layer(layer: &v1::Layer) -> Bytes {
     v1::Map { header: None, layers: vec![layer.clone()] }.encode_to_vec().into()
 }

@@ -14,7 +14,7 @@ pub enum MapError {
     TooLong {
         /// Bytes of the encoded map.
         length: usize,
-        /// [`crate::limits::Limits::map_bytes`].
+        /// Greatest length in bytes, [`crate::limits::Limits::map_bytes`].
         allowed: usize,
     },
     /// The map has more layers, channels, planes, sensors and names than the reader accepts.
@@ -22,7 +22,7 @@ pub enum MapError {
     TooManyParts {
         /// Number that the map claims.
         parts: usize,
-        /// [`crate::limits::Limits::map_parts`].
+        /// Greatest number of parts, [`crate::limits::Limits::map_parts`].
         allowed: usize,
     },
     /// The bytes are not a protobuf `clearway.v1.Map`.
@@ -37,9 +37,9 @@ pub enum MapError {
     /// The map has a later major version of the wire.
     #[error("wire of version {version}; this reader knows versions up to {known}")]
     Version {
-        /// `Header.wire_version`.
+        /// The version in `Header.wire_version`.
         version: u32,
-        /// [`crate::limits::WIRE_VERSION`].
+        /// The newest version that this reader knows, [`crate::limits::WIRE_VERSION`].
         known: u32,
     },
     /// Two layers, or two channels of a layer, have one name.
@@ -47,7 +47,7 @@ pub enum MapError {
     Twice {
         /// `layer` or `channel`.
         what: &'static str,
-        /// The name.
+        /// The name that occurs twice.
         name: String,
     },
     /// A grid is absent or impossible.
@@ -63,7 +63,7 @@ pub enum MapError {
     TooManyCells {
         /// Number that the channels claim.
         cells: u64,
-        /// [`crate::limits::Limits::map_cells`].
+        /// Greatest number of cells, [`crate::limits::Limits::map_cells`].
         allowed: u64,
     },
     /// A channel has another number of cells than its grid.
@@ -73,7 +73,7 @@ pub enum MapError {
         layer: String,
         /// Name of the channel.
         channel: String,
-        /// `Channel.cell_count`.
+        /// Number of cells in `Channel.cell_count`.
         cell_count: u32,
         /// Cells of the grid.
         expected: u64,
@@ -85,7 +85,7 @@ pub enum MapError {
         layer: String,
         /// Name of the channel.
         channel: String,
-        /// What is wrong with the cells.
+        /// Fault of the cells.
         source: DecodeError,
     },
     /// A delta came without its base map, or the base map does not have the layer.
@@ -101,17 +101,17 @@ pub enum MapError {
     OtherBase {
         /// Name of the layer.
         layer: String,
-        /// The base map.
+        /// The map that the delta needs as its base.
         needed: Box<MapId>,
         /// The map that was given.
         given: Box<MapId>,
     },
-    /// The cells of a delta cannot be compared with those of its base layer.
+    /// The cells of a delta cannot be compared with the cells of its base layer.
     #[error("layer {layer:?} is a delta that does not fit its base: {source}")]
     BaseShape {
         /// Name of the layer.
         layer: String,
-        /// What is different.
+        /// How the grids differ.
         source: BaseError,
     },
     /// The class table of a channel was refused.
@@ -121,7 +121,7 @@ pub enum MapError {
         layer: String,
         /// Name of the channel.
         channel: String,
-        /// What is wrong with the table.
+        /// Fault of the class table.
         source: ByClassError,
     },
     /// A safe point is impossible.
@@ -139,7 +139,7 @@ pub enum MapError {
     Legend {
         /// Name of the layer.
         layer: String,
-        /// What is wrong with the legend.
+        /// Fault of the legend.
         source: LegendError,
     },
     /// A cell has a class that the legend does not name.

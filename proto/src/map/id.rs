@@ -5,11 +5,11 @@ use crate::v1;
 /// Identifies one map among all maps of all vehicles and runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MapId {
-    /// `Header.vehicle`.
+    /// Name of the vehicle, `Header.vehicle`.
     pub vehicle: String,
-    /// `Header.boot_id`.
+    /// Run of the server that made the map, `Header.boot_id`.
     pub boot_id: u64,
-    /// `Header.sequence`.
+    /// Number of the map in this run, `Header.sequence`.
     pub sequence: u64,
 }
 

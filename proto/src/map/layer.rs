@@ -58,7 +58,7 @@ pub struct Channel {
     pub unit: String,
     /// Factor from a raw value to a value in [`Channel::unit`].
     pub scale: f32,
-    /// Raw value of a cell of which nothing is known.
+    /// Raw value of an unknown cell.
     pub unknown: i32,
     /// Raw values in the order of the cell index.
     pub cells: Cells,
@@ -101,8 +101,8 @@ impl Layer {
         Some((value, self.legend.get(usize::from(value))?))
     }
 
-    /// Value of a channel at a point (ego frame, metres), in the channel's unit. `None` outside the grid, in a cell of
-    /// which nothing is known, and if the layer has no such channel.
+    /// Value of a channel at a point (ego frame, metres), in the channel's unit. `None` outside the grid, in an unknown
+    /// cell, and if the layer has no such channel.
     pub fn value_at(&self, channel: &str, x_m: f64, y_m: f64) -> Option<f64> {
         self.channel(channel)?.value(self.grid.cell_at(x_m, y_m)?)
     }

@@ -82,7 +82,7 @@ pub(crate) fn unpack(layer: &str, packed: &v1::SafePoints, points_max: usize) ->
     Ok(points)
 }
 
-/// Adds the links other than those to the point before. `wrong` makes the error of a point.
+/// Adds the links other than links to the point before. `wrong` makes the error of a point.
 fn add_links(
     points: &mut [SafePoint],
     link_from: &[u32],

@@ -25,13 +25,13 @@ pub enum ControlError {
         to_microseconds(*at_s), to_microseconds(*from_s), to_microseconds(*to_s)
     )]
     Outside {
-        /// The field.
+        /// Field of the request with the time.
         what: &'static str,
         /// The requested time, in seconds after the first event.
         at_s: f64,
-        /// Begin of what is allowed.
+        /// Begin of the played range, in seconds after the first event.
         from_s: f64,
-        /// End of what is allowed.
+        /// End of the played range, in seconds after the first event.
         to_s: f64,
     },
     /// The range ends before it begins.
@@ -140,7 +140,7 @@ pub struct ReplayInput {
 }
 
 impl ReplayHandle {
-    /// A handle and its other end.
+    /// A handle, and the input on which the replay receives its requests.
     pub fn new(state: v1::ReplayState) -> (Self, ReplayInput) {
         let (commands, requests) = mpsc::unbounded_channel();
         let (sender, state) = watch::channel(state);
@@ -162,7 +162,7 @@ impl ReplayHandle {
         self.state.clone()
     }
 
-    /// Ends the replay.
+    /// Ends the replay before the end of its files.
     pub fn stop(&self) {
         // Fails if it has ended already.
         let _ = self.commands.send(Command::Stop);

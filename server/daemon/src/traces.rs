@@ -107,9 +107,9 @@ impl Traces {
 pub struct StageTimes {
     /// From the arrival of the map's event until the engine took it.
     pub receive: Option<Duration>,
-    /// Computation.
+    /// Computation of the map by the engine.
     pub map: Option<Duration>,
-    /// Encoding.
+    /// Encoding of the map for readers.
     pub encode: Option<Duration>,
     /// From the end of the capture until the publication.
     pub total: Option<Duration>,

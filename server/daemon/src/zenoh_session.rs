@@ -43,7 +43,7 @@ const LIMITS: [(&str, &str); 12] = [
     ("transport/link/tx/queue/congestion_control/block", "{ wait_before_close: 1000000 }"),
 ];
 /// The longest message of a peer, in bytes, unless observations may be longer. zenoh drops a longer message before it
-/// is assembled; a shorter one that is still too long is refused with a reason.
+/// is assembled; a shorter message that is still too long is refused with a reason.
 const MESSAGE_BYTES_MAX: usize = 64 << 20;
 
 /// An operation on the zenoh session failed.
@@ -215,8 +215,8 @@ fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config,
     Ok(config)
 }
 
-/// Replaces the paths of certificates by those of the files: beside the configuration of zenoh that names them, else in
-/// the folder in which the server was started.
+/// Replaces the names of certificates by the paths of the files: beside the configuration of zenoh that names them,
+/// else in the folder in which the server was started.
 fn find_certificates(config: &mut Config, file: &Path) -> Result<(), ZenohError> {
     for name in CERTIFICATE_FILES {
         let key = format!("transport/link/tls/{name}");

@@ -66,7 +66,7 @@ pub struct ReplayProgress {
 
 /// A replay whose server runs, before its first event.
 pub struct ReplayRun {
-    /// The server.
+    /// The server that publishes the replayed maps.
     pub running: Running,
     /// How far the files are read.
     pub progress: ReplayProgress,
@@ -150,7 +150,7 @@ impl ReplayRun {
         &self.summary.mount
     }
 
-    /// Controls the replay.
+    /// Returns a handle that pauses, seeks and stops the replay.
     pub fn handle(&self) -> ReplayHandle {
         self.handle.clone()
     }
@@ -272,7 +272,7 @@ fn initial_state(options: &ReplayOptions, extent: Option<(i64, i64)>) -> Result<
     }
     if let Some(seconds) = served.seek_s {
         let seek = v1::ReplayControl { seek_ns: Some(at(seconds)), ..Default::default() };
-        // `view --from`, which is the only one that seeks at the start.
+        // `view --from`, which is the only option that seeks at the start.
         check(&seek, &state, false).map_err(|error| match error {
             ControlError::Outside { at_s, from_s, to_s, .. } => {
                 ControlError::Outside { what: "from", at_s, from_s, to_s }

@@ -7,7 +7,8 @@ use clearway_daemon::config::{Calibrations, Config};
 use super::error::ReplayError;
 use super::options::ReplayOptions;
 
-/// A configuration with the overrides of the options; the calibration tables that they name replace those in `tables`.
+/// A configuration with the overrides of the options; the calibration tables that they name replace the tables in
+/// `tables`.
 pub(super) fn overridden(
     config: Config,
     options: &ReplayOptions,

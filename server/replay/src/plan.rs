@@ -163,8 +163,8 @@ fn check(options: &ReplayOptions, mcap: Option<&Path>, journal: bool) -> Result<
     check_record(&options.files, record)
 }
 
-/// Refuses a file of `--record` that exists, is no file, or would become one of the files of a folder that is replayed.
-/// The recorder refuses the name of an earlier recording's parts, and of one that is being written.
+/// Refuses a file of `--record` that exists, is no file, or would become a file of a replayed folder. The recorder
+/// refuses the name of an earlier recording's parts, and of a recording that is being written.
 fn check_record(files: &[PathBuf], record: &Path) -> Result<(), ReplayError> {
     let refused = |reason: &str| Err(ReplayError::path("--record", record, reason));
     let name = record.as_os_str().as_encoded_bytes();
@@ -359,7 +359,7 @@ fn configured(options: &ReplayOptions, recorded: Option<&Path>) -> Result<KnownV
         if recording.header().config.is_some() {
             let (mut config, mut tables) = run_config(&recording)?;
             pick(file, &mut config, &mut tables)?;
-            // The publishers, the files and the recorder of the recorded run are not those of this run.
+            // This run does not use the publishers, the files and the recorder of the recorded run.
             let config = Config { vehicles: config.vehicles, ..Config::default() };
             let config = overridden(config, options, file, &mut tables)?;
             return Ok(known(config, tables, Some(recording.header().boot_id), true));

@@ -13,13 +13,13 @@ use crate::files::{Kind, Readings};
 
 /// A recording of this server.
 pub(super) struct Recorded {
-    /// The file.
+    /// Path of the recording.
     pub file: PathBuf,
-    /// Its configuration.
+    /// The recorded configuration.
     pub config: Config,
-    /// Its calibration tables.
+    /// The recorded calibration tables, by vehicle and sensor.
     pub tables: Calibrations,
-    /// Boot id of its maps.
+    /// Boot id of the recorded maps.
     pub boot_id: u64,
 }
 
@@ -57,7 +57,7 @@ pub(super) fn files_of_vehicle(options: &ReplayOptions, files: &Readings) -> Res
     Ok(Some(of_vehicle.into_iter().map(|recording| recording.file).collect()))
 }
 
-/// Refuses a configuration whose vehicle or sensors are not those of the recording: events name a sensor by its place.
+/// Refuses a configuration whose vehicle or sensors differ from the recording's: events name a sensor by its place.
 pub(super) fn check_sensors(file: &Path, config: &Config, recording: &Path) -> Result<(), ReplayError> {
     let recording = RecordingReader::open(recording)?;
     if recording.header().config.is_none() {

@@ -41,7 +41,7 @@ pub struct InfoArguments {
     json: bool,
 }
 
-/// Prints the description of the file. One that is not whole is [`Exit::Unreadable`].
+/// Prints the description of the file. A file that is not whole is [`Exit::Unreadable`].
 ///
 /// # Errors
 /// If the file cannot be read or its kind is not known.

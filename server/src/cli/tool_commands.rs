@@ -21,7 +21,7 @@ pub enum ToolCommand {
 /// Runs a subcommand.
 ///
 /// # Errors
-/// Those of the subcommand.
+/// The errors of the subcommand.
 pub fn run(command: ToolCommand) -> Result<Exit> {
     match command {
         ToolCommand::Demo(arguments) => demo::run(arguments)?,

@@ -1,4 +1,4 @@
-//! `clearway top`: a server -> a live table of its vehicles and those of the servers it knows, the worst first.
+//! `clearway top`: a server -> a live table of the vehicles of the server and of the servers it knows, the worst first.
 
 use anyhow::Result;
 use clap::Args;
@@ -71,7 +71,7 @@ async fn show(options: &TopArguments, screen: &Screen) -> Result<()> {
     Ok(())
 }
 
-/// The server's own vehicles and, of a list, those of other servers; of these the ones with these names, or all.
+/// The server's own vehicles and the vehicles of other servers in a list; only the vehicles with these names, or all.
 fn with_others(own: Vec<v1::Vehicle>, list: Vec<v1::Vehicle>, names: &[String]) -> Vec<v1::Vehicle> {
     let is_own = |of: &v1::Vehicle| own.iter().any(|own| (&own.name, own.boot_id) == (&of.name, of.boot_id));
     let others: Vec<_> = list.into_iter().filter(|of| !is_own(of)).collect();
@@ -204,8 +204,8 @@ impl Screen {
         (usize::from(rows).saturating_sub(1), columns.into())
     }
 
-    /// Shows `lines` in place of those before; elsewhere than on a terminal an empty line follows them. `false` if the
-    /// reader of stdout has closed it.
+    /// Shows `lines` in place of the lines before; elsewhere than on a terminal an empty line follows them. `false` if
+    /// the reader of stdout has closed it.
     fn show(&self, lines: &[String]) -> Result<bool> {
         if !self.is_live() {
             return print(&format!("{}\n\n", lines.join("\n")));

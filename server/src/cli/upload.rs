@@ -54,7 +54,7 @@ fn parts(folder: &Path) -> Result<Vec<PathBuf>> {
     upload::unconfirmed(folder).map_err(|error| anyhow!("{}: {}", folder.display(), advised(folder, error)))
 }
 
-/// Sends every finished part; returns the number of those that are not confirmed.
+/// Sends every finished part; returns the number of parts that are not confirmed.
 async fn send_all(options: &UploadArguments, store: &dyn ObjectStore) -> Result<u64> {
     let mut failed = 0;
     for part in parts(&options.folder)? {

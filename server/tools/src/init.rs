@@ -22,11 +22,11 @@ use clearway_daemon::config::Config;
 use clearway_journal::counted::counted;
 use clearway_replay::files::ground_revolutions::{GroundRevolutions, points_of};
 
-/// Receive buffer of a socket, in bytes: that of a server.
+/// Receive buffer of a socket, in bytes, as of a server.
 const RECEIVE_BUFFER_BYTES: usize = 4 << 20;
 /// Port of the receiver of telemetry, as sensors leave the factory.
 const TELEMETRY_PORT: u16 = 8308;
-/// Longest datagram that is read, in bytes; those of a Velodyne have 1206 and 512.
+/// Longest datagram that is read, in bytes; a Velodyne sends 1206 and 512.
 const DATAGRAM_BYTES: usize = 2048;
 
 /// Where sensors are looked for.

@@ -8,17 +8,17 @@ const STREET_MPS: f64 = 8.0;
 
 /// A scene that subcommands know by its name.
 pub struct NamedScene {
-    /// Its name.
+    /// Name of the scene on the command line.
     pub name: &'static str,
-    /// What it shows.
+    /// What the scene shows, in words.
     pub description: &'static str,
     /// Number of revolutions by which maps are judged: one where nothing moves.
     pub revolutions: u64,
-    /// Builds it.
+    /// Function that builds the scene.
     pub make: fn() -> Scene,
 }
 
-/// All scenes.
+/// All scenes, in the order in which `--help` lists them.
 pub const SCENES: [NamedScene; 7] = [
     NamedScene {
         name: "town",

@@ -41,7 +41,7 @@ pub struct SendOptions {
     pub telemetry_to: SocketAddr,
     /// Address to send from.
     pub own: SocketAddr,
-    /// Speed.
+    /// How fast the datagrams are sent.
     pub pace: Pace,
     /// True: the file is sent again and again.
     pub repeats: bool,
@@ -49,7 +49,7 @@ pub struct SendOptions {
     pub faults: Option<Faults>,
 }
 
-/// What was sent.
+/// Counts of what was sent, with the time that it took.
 #[derive(Clone, Debug)]
 pub struct SendSummary {
     /// Number of datagrams.

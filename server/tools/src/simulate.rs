@@ -19,7 +19,7 @@ use etherparse::PacketBuilder;
 /// A drive of a simulated vehicle with one LIDAR on its roof.
 #[derive(Clone, Debug)]
 pub struct SimulatedDrive {
-    /// The scene.
+    /// The scene in which the vehicle drives.
     pub scene: Scene,
     /// Model of the sensor.
     pub model: Model,

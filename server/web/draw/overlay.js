@@ -34,7 +34,7 @@ export function drawRings(pen, view, size) {
     const ring = new Path2D();
     ring.arc(px, py, radius, 0, 2 * Math.PI);
     strokeTwice(pen, ring, [["rgb(0 0 0 / 35%)", 2.5], ["rgb(255 255 255 / 65%)", 1]]);
-    // Labels stand ahead and to the right, where those of neighbouring rings do not touch.
+    // Labels stand ahead and to the right, where labels of neighbouring rings do not touch.
     const x = px + radius * Math.SQRT1_2, y = py - radius * Math.SQRT1_2;
     pen.lineWidth = 3.5;
     pen.strokeStyle = "rgb(0 0 0 / 75%)";

@@ -7,13 +7,14 @@ import { idColour, scaleColour, UNKNOWN, word } from "./palette.js";
 const least = (cells) => (cells instanceof Int8Array ? -128 : 0);
 const tableLength = (cells) => 2 ** (8 * cells.BYTES_PER_ELEMENT);
 
-// True if the values of a channel are ids, of which only equality means something.
+// True if the values of a channel are ids: only their equality means something.
 export const isId = ({ unit }) => unit === "id";
 
 // { colours, legend, range, bar }. colours: an ImageData word for each raw value. legend: [[colour or null, text,
-// share?, meaning?]]. The wire gives the classes' colours and meanings; that of "unknown" holds for every channel.
-// range: [least, greatest] value shown so far in the channel's unit, which `range` was before this map, or null.
-// bar: the texts of a colour bar's ends and middle, from the least value to the greatest; null if the channel has none.
+// share?, meaning?]]. The wire gives the classes' colours and meanings; the meaning of "unknown" holds for every
+// channel. range: [least, greatest] value shown so far in the channel's unit, which `range` was before this map, or
+// null. bar: the texts of a colour bar's ends and middle, from the least value to the greatest; null if the channel has
+// none.
 export function paintChannel(layer, channel, cells, range) {
   if (channel.name === "class") return paintClasses(layer, cells);
   const unknown_colour = layer.legend[0]?.colour ?? UNKNOWN;
@@ -61,7 +62,7 @@ export function fadeSlices(pixels, table, { is_straight, shape: [rows, columns],
 }
 
 // Draws a layer over pixels that are painted: half of its colour and half of theirs. colours: an ImageData word for
-// each raw value, 0 for those that leave a pixel as it is.
+// each raw value, 0 for values that leave a pixel as it is.
 export function blendPixels(pixels, table, cells, colours) {
   const low = least(cells), half = 0x7f7f7f7f;
   for (let i = 0; i < table.length; i++) {
@@ -70,7 +71,7 @@ export function blendPixels(pixels, table, cells, colours) {
   }
 }
 
-// The colours of the classes of a layer that is drawn over another one: those of which `is_drawn(class)` is true.
+// The colours of the classes of a layer that is drawn over another layer: of the classes with `is_drawn(class)`.
 export function overlayColours(legend, is_drawn) {
   const colours = new Uint32Array(256);
   legend.forEach((entry, value) => {

@@ -117,7 +117,8 @@ export class Scene {
     this.#cloud.count = xyz.length / 3;
   }
 
-  // pixels: of the canvas for each CSS pixel. move: { x, y, yaw }: where the points' ego frame is in that of the cells.
+  // pixels: of the canvas for each CSS pixel. move: { x, y, yaw }: the pose of the points' ego frame in the cells' ego
+  // frame.
   draw(matrix, pixels, move) {
     const gl = this.#gl;
     gl.viewport(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight);

@@ -1,8 +1,8 @@
 // In: a map. Out: the planes in which the cells of all its layers lie, z = a x + b y + c in the ego frame, metres.
 //
-// The plane at a point is, in this order: that of the cell of the layer `terrain` (its channels height, slope_x and
-// slope_y; only with `planes = true`), that of the segment of the layer `drivability`, else the ground plane under the
-// vehicle, z = 0.
+// The plane at a point is, in this order: the plane of the cell of the layer `terrain` (its channels height, slope_x
+// and slope_y; only with `planes = true`), the plane of the segment of the layer `drivability`, the ground plane under
+// the vehicle, z = 0.
 
 const PLANE = ["height", "slope_x", "slope_y"];
 const LEVEL = [0, 0, 0];
@@ -29,7 +29,7 @@ function terrainPlanes(layer) {
     if (cell < 0 || height[cell] === channels[0].unknown) return null;
     const [h, a, b] = [height, slope_x, slope_y].map((raw, i) => raw[cell] * channels[i].scale);
     layer.grid.corners(cell, xy);
-    // The height is that of the cell's centre.
+    // The height is the height of the cell's centre.
     return [a, b, h - (a * (xy[0] + xy[4])) / 2 - (b * (xy[1] + xy[5])) / 2];
   };
   return { layer: layer.name, of };

@@ -1,5 +1,5 @@
-// In: a binary message of the server. Out: the points of one vehicle, if it is a frame of points. The format is that of
-// server/daemon/src/publish/page_points.rs.
+// In: a binary message of the server. Out: the points of one vehicle, if it is a frame of points. The format is defined
+// in server/daemon/src/publish/page_points.rs.
 
 import { egoFrom, yawOf } from "../vehicle/view.js";
 import { DecodeError } from "../wire/limits.js";
@@ -11,7 +11,7 @@ const viewOf = (bytes) => new DataView(bytes.buffer, bytes.byteOffset, bytes.byt
 // True if a message begins as a frame of points does. A MapUpdate never does.
 export const isPoints = (bytes) => bytes.length >= 4 && viewOf(bytes).getUint32(0, true) === MAGIC;
 
-// { vehicle, capture_end_ns, total: points of the map, count: those in the frame, xyz: Int16Array, centimetres, ego
+// { vehicle, capture_end_ns, total: points of the map, count: points in the frame, xyz: Int16Array, centimetres, ego
 // frame }. Throws a DecodeError.
 export function readPoints(bytes) {
   const error = (what) => new DecodeError("points", what);
@@ -42,8 +42,8 @@ export class Poses {
     if (this.#poses.length > POSES_MAX) this.#poses.shift();
   }
 
-  // Where the ego frame at a time is in that of the newest map: { x, y, yaw }; null if it is not known. Between two
-  // maps the vehicle moves evenly.
+  // Pose of the ego frame at a time in the ego frame of the newest map: { x, y, yaw }; null if it is not known. Between
+  // two maps the vehicle moves evenly.
   move(stamp_ns) {
     const after = this.#poses.findIndex((at) => at.stamp_ns >= stamp_ns), to = this.#poses[after];
     if (!to || (after === 0 && to.stamp_ns !== stamp_ns)) return null;

@@ -57,7 +57,7 @@ export class QuadList {
     this.pushInPlane(xy, plane, height, colour);
   }
 
-  // All quads of another list, after those so far.
+  // All quads of another list, after the quads so far.
   append(list) {
     while ((this.count + list.count) * QUAD_BYTES > this.#words.byteLength) this.#grow();
     new Uint8Array(this.#words.buffer).set(list.bytes, this.count * QUAD_BYTES);

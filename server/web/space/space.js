@@ -108,7 +108,7 @@ export class Space {
     this.#points = points;
     this.#schedule();
     if (points.reason) return;
-    // The next one is asked for when this one is drawn: a hidden page draws nothing.
+    // The next frame is asked for when this frame is drawn: a hidden page draws nothing.
     requestAnimationFrame(() => this.#wantsPoints && this.#ask({ vehicle: this.#vehicle, wanted: true }));
   }
 
@@ -163,7 +163,7 @@ export class Space {
     setText($("space-text"), "waiting for the browser to give WebGL back");
   }
 
-  // Nothing of the old scene is left: the frame and the outline are drawn as new ones.
+  // Nothing of the old scene is left: the frame and the outline are drawn again.
   #restore() {
     [this.#is_lost, this.#frame, this.#outline] = [false, null, null];
     this.#changed();

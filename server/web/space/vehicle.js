@@ -13,7 +13,7 @@ const PROBE = word([255, 255, 255]), PROBE_M = 0.7, PROBE_Z_M = 0.24;
 const RING_WIDTH_M = 0.12, RING_Z_M = 0.12;
 // Length and width of a vehicle whose configuration has no outline, metres.
 const LENGTH_M = 4.5, WIDTH_M = 1.8;
-// The configuration has no height: that of a car.
+// Heights of a car, because the configuration has none.
 const FLOOR_M = 0.3, BODY_M = 0.6, CABIN_M = 0.6;
 
 // outline: x0, y0, x1, y1 ... in the ego frame, metres; empty if there is none. The cabin is at the back of the middle,

@@ -40,7 +40,7 @@ export class VehicleView {
   #status_arrived_ms = null;
   #layer_names = [];
   #link = { phase: "connecting", text: "Connecting …" };
-  // When maps were drawn on this connection: the first, and those of the last RATE_OVER_MS.
+  // When maps were drawn on this connection: the first map, and the maps of the last RATE_OVER_MS.
   #first_drawn_ms = null;
   #drawn_ms = [];
   #history = new History();
@@ -258,7 +258,7 @@ export class VehicleView {
 
   #rate(now_ms) {
     this.#drawn_ms = this.#drawn_ms.filter((at) => now_ms - at <= RATE_OVER_MS);
-    // Until a connection is RATE_OVER_MS old, the rate is that of the intervals so far.
+    // Until a connection is RATE_OVER_MS old, the rate comes from the intervals so far.
     const over_ms = this.#first_drawn_ms === null ? 0 : now_ms - this.#first_drawn_ms, maps = this.#drawn_ms.length;
     const per_ms = over_ms >= RATE_OVER_MS ? maps / RATE_OVER_MS : (maps - 1) / over_ms;
     return this.#link.phase === "live" && Number.isFinite(per_ms) && per_ms > 0 ? 1e3 * per_ms : 0;

@@ -3,8 +3,8 @@
 //!
 //! In: the revolutions, and the seconds of each part. Out, for each part: the age of the maps at the healthy readers,
 //! the maps they missed, the growth of the server's resident set, and the age of the first new map of the stopped
-//! reader after it resumes (new: not already sent when it resumed). The stopped reader stops reading, as a planner
-//! that hangs; its connection still answers pings (the server drops one that does not after 20 s). The slow reader
+//! reader after it resumes (new: not already sent when it resumed). The stopped reader stops reading, as a planner that
+//! hangs; its connection still answers pings (the server drops a connection that does not after 20 s). The slow reader
 //! reads all the time over a slow link. Both have tonic's default windows, and the credits that our client requests.
 
 use std::net::SocketAddr;

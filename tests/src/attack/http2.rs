@@ -32,10 +32,10 @@ pub const END_HEADERS: u8 = 4;
 const INITIAL_WINDOW: u16 = 4;
 /// The path of the streams of maps.
 pub const WATCH: &str = "/clearway.v1.MapService/Watch";
-/// The largest window.
+/// The largest window that HTTP/2 allows, in bytes.
 pub const WINDOW_MAX: u32 = (1 << 31) - 1;
 
-/// A frame.
+/// The bytes of an HTTP/2 frame.
 pub fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
     let length = u32::try_from(payload.len()).expect("a short frame").to_be_bytes();
     [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
@@ -101,7 +101,7 @@ pub fn reset(stream: u32) -> Vec<u8> {
 /// Opens `connections` connections with `streams` streams of maps each, and the largest windows; nothing is ever read.
 ///
 /// # Errors
-/// If the server does not accept a connection; one that it closes afterwards is no error.
+/// If the server does not accept a connection; a connection that it closes afterwards is no error.
 pub async fn never_read(address: SocketAddr, connections: usize, streams: u32) -> io::Result<Vec<TcpStream>> {
     let mut held = Vec::new();
     for _ in 0..connections {

@@ -11,7 +11,7 @@ use super::http2;
 /// What a connection sends before it is silent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Opening {
-    /// Nothing.
+    /// No byte is sent.
     Nothing,
     /// The first byte of the HTTP/2 preface.
     OneByte,
@@ -25,7 +25,7 @@ pub enum Opening {
     HalfHandshake,
 }
 
-/// All openings.
+/// All openings, in the order of the enum.
 pub const OPENINGS: [Opening; 6] = [
     Opening::Nothing,
     Opening::OneByte,

@@ -18,7 +18,7 @@ const UPGRADE: &[u8] = b"GET /live HTTP/1.1\r\nHost: localhost\r\nConnection: Up
 const FOXGLOVE: &[u8] = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
     Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n\
     Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
-/// Channels of one vehicle, and subscriptions of one client, of which 256 are allowed.
+/// Channels of one vehicle, and subscriptions of one client, as many as are allowed.
 const CHANNELS: u32 = 10;
 const SUBSCRIPTIONS: u32 = 256;
 const SELECTION: &str = r#"{"type":"watch","vehicle":"car","layers":["speed"]}"#;

@@ -37,7 +37,7 @@ fn zenoh(target: &Target) -> SocketAddr {
     target.zenoh.trim_start_matches("tcp/").parse().expect("an address of ours")
 }
 
-/// Keeps [`CONNECTIONS`] open, each with these bytes sent and nothing read; opens those again that are cut.
+/// Keeps [`CONNECTIONS`] open, each with these bytes sent and nothing read; opens connections again that are cut.
 async fn hold(at: SocketAddr, bytes: &'static [u8]) {
     join_all((0..CONNECTIONS).map(|_| async move {
         loop {

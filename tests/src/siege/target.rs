@@ -5,19 +5,19 @@ use std::net::{Ipv4Addr, SocketAddr};
 use futures::future::BoxFuture;
 use tokio::net::{TcpSocket, TcpStream};
 
-/// The address that TCP attacks come from: another one than that of the honest peers, because limits are by address.
+/// The address that TCP attacks come from: not the address of the honest peers, because limits are by address.
 const ATTACKER: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
 /// Where the server under attack listens.
 #[derive(Clone, Debug)]
 pub struct Target {
-    /// gRPC.
+    /// Address of the gRPC listener.
     pub grpc: SocketAddr,
-    /// The page.
+    /// Address of the page's listener.
     pub page: SocketAddr,
-    /// Foxglove's WebSocket.
+    /// Address of the WebSocket listener for Foxglove.
     pub foxglove: SocketAddr,
-    /// Datagrams of the sensor.
+    /// Address that receives the sensor's datagrams.
     pub udp: SocketAddr,
     /// zenoh, such as `tcp/127.0.0.1:7447`.
     pub zenoh: String,
@@ -28,7 +28,7 @@ pub struct Target {
 pub struct Attack {
     /// What it does, in a few words.
     pub name: &'static str,
-    /// Runs it.
+    /// Runs the attack on a target.
     pub run: fn(Target) -> BoxFuture<'static, ()>,
 }
 

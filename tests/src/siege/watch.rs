@@ -64,7 +64,7 @@ impl SiegeReader {
         std::mem::take(&mut *self.seen.lock().expect("the reader does not panic"))
     }
 
-    /// Ends it.
+    /// Stops the reader and waits for its thread.
     pub fn stop(self) {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().expect("the reader does not panic");
@@ -139,7 +139,7 @@ impl Sender {
         due.saturating_sub(self.accepted.swap(0, Ordering::Relaxed))
     }
 
-    /// Ends it.
+    /// Stops the sender and waits for its thread.
     pub fn stop(self) {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().expect("the sender does not panic");

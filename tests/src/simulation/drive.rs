@@ -19,7 +19,7 @@ const START_NS: i64 = 1_767_270_000_000_000_000;
 pub struct Sent {
     /// Time after the beginning of the drive, in ns.
     pub offset_ns: i64,
-    /// The reading.
+    /// The reading that is sent.
     pub reading: Reading,
 }
 
@@ -32,7 +32,7 @@ pub enum Reading {
     Observation(Box<v1::Observation>),
 }
 
-/// A simulated drive.
+/// A simulated drive: what the car and its sensors send.
 #[derive(Debug)]
 pub struct Drive {
     /// The car and its sensors.

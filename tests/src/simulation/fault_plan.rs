@@ -46,7 +46,7 @@ pub enum InjectedFault {
     LostOutcome,
     /// A sensor sends nothing more, and does not recover.
     SilentSensor,
-    /// The stamp of a map equals that of the map before.
+    /// The stamp of a map equals the stamp of the map before.
     StuckStamp,
 }
 
@@ -115,7 +115,7 @@ pub struct FaultPlan {
     pub drive: usize,
     /// Offset in the drive at which the run begins, in ns.
     pub offset_ns: i64,
-    /// True if every layer is made, not only the cheap ones.
+    /// True if every layer is made, not only the cheap layers.
     pub all_maps: bool,
     /// Faults of the network of each rotating sensor.
     pub networks: Vec<Faults>,

@@ -40,7 +40,7 @@ pub enum Habit {
     Fickle,
 }
 
-/// One reader.
+/// A simulated reader with its habit and its layers.
 pub struct SimulatedReader {
     habit: Habit,
     layers: Vec<String>,
@@ -161,7 +161,7 @@ impl SimulatedReader {
             _ => self.last,
         };
         let Some((_, requests)) = &self.open else { return };
-        // The other end lives as long as this one.
+        // The other end lives as long as this end.
         let _ = requests.unbounded_send(Ok(v1::WatchRequest { acknowledged, ..Default::default() }));
         if let Some(acknowledged) = acknowledged {
             self.in_flight.retain(|sent| *sent > acknowledged);

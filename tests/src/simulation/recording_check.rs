@@ -17,7 +17,7 @@ use super::fault_plan::DiskFault;
 /// One file on the disk in memory.
 #[derive(Clone, Debug, Default)]
 pub struct MemoryFile {
-    /// Everything written.
+    /// All bytes that were written.
     pub bytes: Vec<u8>,
     /// Number of bytes that survive a power cut for certain.
     pub synced: usize,
@@ -57,7 +57,7 @@ impl MemoryDisk {
         self.state().files.clone()
     }
 
-    /// The files after a power cut, of each of which at most `torn` bytes more than the synced ones are left.
+    /// The files after a power cut: each keeps its synced bytes and at most `torn` bytes more.
     pub fn files_after_crash(&self, torn: usize) -> BTreeMap<u64, MemoryFile> {
         let mut files = self.files();
         files.values_mut().for_each(|file| file.bytes.truncate(file.synced + torn));

@@ -33,8 +33,8 @@ use super::fault_plan::{
 use super::readers::{SimulatedReader, readers};
 use super::recording_check::{MemoryDisk, Recorded};
 
-/// Revolutions with a covered window until maps must show it: the one in which it was covered, another, and those in
-/// which the newest scan of a stopped sensor may still contribute.
+/// Revolutions with a covered window until maps must show it: the revolution in which it was covered, another
+/// revolution, and the revolutions in which the newest scan of a stopped sensor may still contribute.
 const REVOLUTIONS_TO_COVER: i64 = 4;
 
 /// The whole system, and the networks of its sensors.

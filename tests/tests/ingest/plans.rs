@@ -187,7 +187,7 @@ async fn a_plan_over_zenoh_is_taken_or_counted() {
         within("zenoh", async { session.put("clearway/car/plan", bytes).await }).await.unwrap();
         until("the refusal is counted", || refused(&running) == count).await;
     }
-    // More at once than wait: those that the rate cannot have let through are counted.
+    // More plans at once than may wait: plans that the rate cannot have let through are counted.
     let (began, before, good) = (Instant::now(), refused(&running), good.encode_to_vec());
     for _ in 0..1000 {
         let put = session.put("clearway/car/plan", good.clone()).congestion_control(CongestionControl::Block);

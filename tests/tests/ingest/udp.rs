@@ -304,7 +304,7 @@ fn send(capture: &Path, from: &str, to: SocketAddr) -> u64 {
 }
 
 /// A map without the fields that depend on the arrival times, on the vehicle's name and on the server's run. The stamps
-/// of the capture are those of the sensor, and stay.
+/// of the capture come from the sensor, and stay.
 fn without_arrival(map: &[u8]) -> v1::Map {
     let mut map = v1::Map::decode(map).unwrap();
     let header = map.header.as_mut().unwrap();

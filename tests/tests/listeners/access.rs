@@ -30,7 +30,7 @@ const TABLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/guide/access
 const BEGIN: &str = "<!-- The table is written by tests/tests/listeners/access.rs. -->\n";
 const END: &str = "<!-- End of the table. -->";
 
-/// Errors that only those get that may make a call: it lacks content, or the server has no recorder or replay.
+/// Errors that only a caller gets that may make a call: it lacks content, or the server has no recorder or replay.
 const OF_CONTENT: [Code; 5] =
     [Code::InvalidArgument, Code::NotFound, Code::OutOfRange, Code::FailedPrecondition, Code::Unimplemented];
 
@@ -61,7 +61,7 @@ const CALLERS: [Caller; 8] = [
 /// What a client attempts.
 #[derive(Clone, Debug)]
 enum Attempt {
-    /// Calls an RPC.
+    /// Calls the RPC with this path.
     Rpc(&'static str),
     /// Receives a sample of a key over zenoh.
     Subscribe(&'static str),
@@ -69,7 +69,7 @@ enum Attempt {
     Query(&'static str),
     /// Sees the liveliness tokens of a key.
     Liveliness(&'static str),
-    /// Sends an observation on a key over zenoh, of which the server gives an account.
+    /// Sends an observation on a key over zenoh, which the server then acknowledges or refuses.
     Observe(&'static str),
     /// Sends a plan over zenoh that the server takes.
     Plan,
@@ -230,7 +230,7 @@ impl Bed {
         if let Some(token) = caller.token {
             request.metadata_mut().insert("authorization", format!("Bearer {token}").parse().unwrap());
         }
-        // An answer, or a complaint about the content of the call, which only those get that may make it.
+        // An answer, or a complaint about the content of the call, which only a caller gets that may make it.
         let answer = client.streaming(request, path, ProstCodec::<(), ()>::default()).await;
         answer.err().is_none_or(|status| OF_CONTENT.contains(&status.code()))
     }
@@ -300,7 +300,7 @@ async fn bed(folder: &Path) -> Bed {
     let running = start(config).await;
     let port = running.zenoh[0].rsplit_once(':').expect("an endpoint").1.to_owned();
     let zenoh = format!("tls/localhost:{port}");
-    // Each in a task of its own: one that is refused takes its time.
+    // Each in a task of its own: a refused session takes its time.
     let opened = join_all(CALLERS.map(|caller| tokio::spawn(session(zenoh.clone(), caller.certificate)))).await;
     let named = CALLERS.iter().map(|caller| caller.name).zip(opened);
     let sessions = named.filter_map(|(name, session)| Some((name, session.expect("no panic")?))).collect();
@@ -336,7 +336,7 @@ async fn observe(bed: &Bed) {
     tokio::join!(store(&received[0]), store(&received[1]), account);
 }
 
-/// Tries every row as every caller, until all those succeed that `expected` names, twice; returns those that succeed.
+/// Tries every row as every caller, until all callers in `expected` succeed, twice; returns the callers that succeed.
 async fn measure(bed: &Bed, expected: &BTreeMap<String, Vec<bool>>) -> BTreeMap<String, Vec<bool>> {
     let rows = rows();
     let found = Mutex::new(rows.iter().map(|(row, _)| (row.clone(), vec![false; CALLERS.len()])).collect());

@@ -127,7 +127,7 @@ async fn frames_of_a_websocket_end_it_if_they_are_too_many() {
 async fn a_frame_of_a_websocket_that_claims_too_much_ends_it_before_it_has_come() {
     let running = start(everything()).await;
     for (name, mut stream) in sockets(&running).await {
-        // A text of 2 MiB, of which nothing follows but one byte.
+        // The header of a text of 2 MiB, followed by one byte alone.
         stream.write_all(&[0x81, 0xff, 0, 0, 0, 0, 0, 0x20, 0, 0, 0, 0, 0, 0, b'x']).await.unwrap();
         let mut pings = 0;
         while let Ok((opcode, _)) = within("it is closed", fixture::frame(&mut stream)).await {

@@ -236,7 +236,7 @@ async fn every_listener_survives_the_lack_of_file_handles_and_a_hangup() {
     for at in [foxglove, page] {
         held.push(within("held connections", hold(at, 100, Opening::Nothing)).await.unwrap());
     }
-    // While they are held: newcomers get the handles of idle connections, also of those of other listeners.
+    // While they are held: newcomers get the handles of idle connections, also of other listeners.
     let began = std::time::Instant::now();
     for at in [page, metrics] {
         within("an answer", async { while !ask(at, &get("/healthz")).await.ends_with("ok\n") {} }).await;

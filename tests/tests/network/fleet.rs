@@ -286,7 +286,8 @@ async fn a_stopped_subscriber_does_not_slow_eight_others() {
     assert!(bytes > 4 << 20, "{bytes} bytes");
     assert!(1000 * given >= 999 * (given + skipped), "{given} maps received, {skipped} skipped");
 
-    // The stopped reader resumes: it reads the waiting maps, then the new ones. Only this reader misses those between.
+    // The stopped reader resumes: it reads the waiting maps, then the new maps. Only this reader misses the maps
+    // between.
     drop(go_on);
     let last_seen = || seen.lock().unwrap().last().copied();
     while last_seen() != Some(next - 1) {

@@ -19,9 +19,9 @@ fn machines(arguments: &[&str]) -> String {
 #[derive(Debug)]
 struct Row {
     fault: String,
-    /// Streams that the fault concerns: those that went STALE, all.
+    /// Streams that the fault concerns: number that went STALE, number of all.
     concerned: [usize; 2],
-    /// The others.
+    /// Streams that the fault does not concern: number that went STALE, number of all.
     others: [usize; 2],
     is_whole: bool,
     /// Why the concerned streams said they were stale, each with their number.

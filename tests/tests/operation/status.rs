@@ -159,7 +159,7 @@ struct Prometheus {
 }
 
 impl Prometheus {
-    /// Starts one that scrapes this address.
+    /// Starts a Prometheus that scrapes this address.
     fn scraping(target: std::net::SocketAddr) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let copy = |file: &str, change: &dyn Fn(&str) -> String| {

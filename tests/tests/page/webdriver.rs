@@ -62,7 +62,7 @@ impl Browser {
         browser
     }
 
-    /// A Chromium like that of a phone: touch, and two pixels for each CSS pixel.
+    /// A Chromium as on a phone: touch, and two pixels for each CSS pixel.
     pub fn start_phone(width: u32, height: u32) -> Self {
         let metrics = json!({ "width": width, "height": height, "pixelRatio": 2, "touch": true });
         Self::begin(width, height, json!({ "deviceMetrics": metrics }), &[])
@@ -204,8 +204,8 @@ impl Drop for Browser {
 
 /// Starts ChromeDriver; returns it with its port and the rest of its output.
 ///
-/// On port 0 it takes a free port of `::1` and then the same port of `127.0.0.1`, and ends when a test beside this one
-/// holds that one.
+/// On port 0 it takes a free port of `::1` and then the same port of `127.0.0.1`, and ends when a test beside this test
+/// holds that port.
 fn start_driver() -> (Child, u16, Lines<BufReader<ChildStdout>>) {
     for _ in 0..STARTS_MAX {
         let mut driver = Command::new("chromedriver")

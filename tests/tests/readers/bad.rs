@@ -1,4 +1,4 @@
-//! Readers that stop, lag, sit idle or reset their streams, beside healthy ones that lose no map because of them.
+//! Readers that stop, lag, sit idle or reset their streams, beside healthy readers that lose no map because of them.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Weak};
@@ -54,7 +54,7 @@ async fn stopped_and_slow_readers_cost_the_others_nothing_and_resume_newest() {
     let server = running.grpc.unwrap();
     let [link, blocked] = [Link::to(server).await, Link::to(server).await];
     [&link, &blocked].iter().for_each(|link| link.allowed.add_permits(SETUP_BYTES));
-    // Small windows as our client has them, and those of a plain client, which hold minutes of maps.
+    // Small windows as our client has them, and the windows of a plain client, which hold minutes of maps.
     let mut slow = Reader::open(&mut plain(link.address).await, of_layer(2)).await.unwrap();
     let mut silent = Reader::open(&mut plain(blocked.address).await, of_layer(0)).await.unwrap();
     let deltas = v1::Selection { deltas: true, ..of_layer(2) };
@@ -92,7 +92,7 @@ async fn stopped_and_slow_readers_cost_the_others_nothing_and_resume_newest() {
         let (sequence, skipped, _) = reader.receive().await;
         assert_eq!((sequence, skipped), (next - 1, next - 2 - on_the_way[1]), "the first new map is the newest one");
     }
-    // The slow reader has at most its credits in flight; after those it receives the newest map.
+    // The slow reader has at most its credits in flight; after these maps it receives the newest map.
     link.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
     let (mut before, mut seen) = (slow.receive().await, 1);
     while before.0 < next - 1 {

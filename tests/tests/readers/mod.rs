@@ -56,7 +56,7 @@ impl Reader {
         within("a map", self.updates.message()).await.map(|update| update.expect("no end"))
     }
 
-    /// Receives and acknowledges the next map: its sequence, the skipped maps before it, and those left out.
+    /// Receives and acknowledges the next map: its sequence, and the numbers of skipped and of left-out maps before it.
     async fn receive(&mut self) -> (u64, u64, u64) {
         let update = self.next().await.expect("a map");
         let sequence = sequence(&update.map);

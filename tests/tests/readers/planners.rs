@@ -157,7 +157,7 @@ fn id(map: &MapView) -> (u64, u64) {
     (map.header().boot_id, map.sequence())
 }
 
-/// Asserts that both planners receive the newest map, count every map since this one, and have the same answers.
+/// Asserts that both planners receive the newest map, count every map since `last`, and have the same answers.
 async fn agree(rust: &mut MapStream, other: &mut Planner, last: Option<(u64, u64)>, newest: u64) -> (u64, u64) {
     let map = loop {
         let map = within("a map", rust.next()).await.expect("the stream goes on").map;

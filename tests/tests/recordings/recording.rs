@@ -333,8 +333,8 @@ fn a_full_disk_ends_the_recording_and_maps_continue() {
 fn a_full_file_system_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
     // A file system in memory of 1.5 MiB, which is gone with the process; so the recording is copied from it. The
-    // network is another one too, because every demo has the same ports. The demo's picture cannot be written either: a
-    // folder has its name.
+    // network is another network too, because every demo has the same ports. The demo's picture cannot be written
+    // either: a folder has its name.
     let mounted = "mkdir \"$1/small\" && mount -t tmpfs -o size=1536k none \"$1/small\" && ip link set lo up || exit 9
         mkdir \"$1/small/full.png.part\"
         \"$0\" demo --seconds 4 --record \"$1/small/full.mcap\"

@@ -1,4 +1,4 @@
-//! The maps of a live run are, byte for byte, those of each replay of its recording, whatever threads there are.
+//! The maps of a live run equal, byte for byte, the maps of each replay of its recording, whatever threads there are.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};

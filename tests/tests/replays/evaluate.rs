@@ -7,7 +7,7 @@ use clearway_tests::{binaries, run};
 use clearway_tools::evaluate::{EvaluateOptions, evaluate};
 use serde_json::Value;
 
-/// Least F1 of the ground points by the shared estimate on the labelled frame and its variations: that of Patchwork++
+/// Least F1 of the ground points by the shared estimate on the labelled frame and its variations: the F1 of Patchwork++
 /// on the frame with 32 lasers.
 const GROUND_F1: f64 = 0.989;
 

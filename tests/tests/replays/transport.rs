@@ -1,4 +1,4 @@
-//! Replays that are controlled: as live, in steps, set back, waiting for their readers. The maps are the recorded ones.
+//! Controlled replays: as live, in steps, set back, waiting for their readers. The maps equal the recorded maps.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

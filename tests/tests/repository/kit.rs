@@ -70,7 +70,7 @@ async fn a_reader_over_zenoh_learns_that_a_replay_has_ended_and_why_one_in_locks
         }
     };
     assert!(matches!(ended, ClientError::ReplayEnded { .. }) && last == Some(9), "{ended} after {last:?}");
-    // One that comes later gets the last map, and then the end.
+    // A subscriber that comes later gets the last map, and then the end.
     let mut late = client.subscribe("car", "drivability").await.unwrap();
     while let Ok(update) = late.next().await {
         assert_eq!(update.map.sequence(), 9);
@@ -192,7 +192,7 @@ fn the_ci_examples_verify_and_compare_and_a_recording_that_is_not_whole_fails_th
     }
 }
 
-/// The scripts of a CI example that call `verify`, each of which its CI runs whatever became of the one before.
+/// The scripts of a CI example that call `verify`; its CI runs each of them also if a script before it failed.
 fn scripts(file: &str) -> Vec<String> {
     let text = fs::read_to_string(workspace().join("deploy/ci").join(file)).unwrap();
     if file == "gitlab.yml" {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::files;
 
-/// The modules of a crate, as `a::b`, and those each of them names in a path.
+/// The modules of a crate, as `a::b`, each with the modules that it names in a path.
 pub fn imports(sources: &Path) -> BTreeMap<String, BTreeSet<String>> {
     let module = |file: &Path| {
         let path = file.strip_prefix(sources).expect("below the sources").with_extension("");

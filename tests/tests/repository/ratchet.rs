@@ -183,7 +183,7 @@ fn lines(values: &Values) -> String {
     })
 }
 
-/// Lowers the values of a section, and removes those that are no exception any more. A section that is not there gets
+/// Lowers the values of a section, and removes values that are no exception any more. A section that is not there gets
 /// today's values.
 fn bless(title: &str, today: &Values) {
     static ONE_AT_A_TIME: std::sync::Mutex<()> = std::sync::Mutex::new(());

@@ -36,7 +36,7 @@ use safe_points::Follower;
 
 use crate::fixture::{config, until, within};
 
-/// Length, width and height of the vehicle, in metres: those of the simulated cars.
+/// Length, width and height of the vehicle, in metres, as of the simulated cars.
 const SIZE_M: [f64; 3] = [4.4, 1.8, 1.5];
 /// Distance of the goal along the route, in metres.
 const GOAL_M: f64 = 10.0;

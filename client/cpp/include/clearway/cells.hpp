@@ -1,8 +1,8 @@
 // The cells of a channel from its payload, as `proto/src/channel` and `client/python/clearway/codec.py` decode them.
 //
-// In: a channel's claims and its payload, also hostile ones. Out: raw cells in the order of the cell index, or an
-// `Error` "cells". The caller bounds the number of cells. The CRC decides whether the cells are right; that
-// a payload is canonical is not checked. Format: `proto/clearway/v1/map.proto`, `Encoding`.
+// In: a channel's claims and its payload, also hostile payloads. Out: raw cells in the order of the cell index, or an
+// `Error` "cells". The caller bounds the number of cells. The CRC decides whether the cells are right; that a payload
+// is canonical is not checked. Format: `proto/clearway/v1/map.proto`, `Encoding`.
 #pragma once
 
 #include <algorithm>

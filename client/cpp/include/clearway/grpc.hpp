@@ -1,8 +1,8 @@
 // Maps of one vehicle over gRPC: the address of a server -> a stream of the newest maps.
 //
-// A stream has one map in flight and acknowledges it when the reader asks for the next one, so the server holds the
-// newest map for the reader, and skips and counts those between. Messages are read and written as bytes: no generated
-// code. Needs gRPC's C++ library (Debian: libgrpc++-dev), the CMake target `clearway::grpc`.
+// A stream has one map in flight and acknowledges it when the reader asks for the next map, so the server holds the
+// newest map for the reader, and skips and counts the maps between. Messages are read and written as bytes: no
+// generated code. Needs gRPC's C++ library (Debian: libgrpc++-dev), the CMake target `clearway::grpc`.
 #pragma once
 
 #include <algorithm>
@@ -128,7 +128,7 @@ inline bool is_lasting(const Error& ended) {
     return std::find(std::begin(REASONS), std::end(REASONS), ended.reason()) != std::end(REASONS);
 }
 
-// True if a map replaces the newest one: it is of another run, later in this one, or the run has begun again in it.
+// True if a map replaces the newest map: it is of another run, later in this one, or the run has begun again in it.
 inline bool replaces(const Map& map, const Map& newest, Clocks now) {
     if (newest.header.boot_id != map.header.boot_id || map.header.sequence > newest.header.sequence) return true;
     const std::int64_t end_ns = newest.header.capture_end_ns;

@@ -1,6 +1,6 @@
 // One decoded and checked map: layers, cells, legends, and its age.
 //
-// In: the bytes of a `clearway.v1.Map` from any transport, also hostile ones, and the base map of layers that are
+// In: the bytes of a `clearway.v1.Map` from any transport, also hostile bytes, and the base map of layers that are
 // deltas. Out: a `Map`, or an `Error` with the first fault. A map that decodes has a meaning for each of its classes.
 #pragma once
 

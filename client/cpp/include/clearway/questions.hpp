@@ -74,7 +74,7 @@ inline std::optional<std::string> why_of(const Layer& layer, std::size_t cell) {
     return raw >= 0 && raw < 9 ? std::string(REASONS[raw]) : "reason " + std::to_string(raw);
 }
 
-// The answer for checked corners; of several cells that forbid it, the one nearest to `from` is named.
+// The answer for checked corners; of several cells that forbid it, the cell nearest to `from` is named.
 inline Answer answer(const Layer& layer, const Polygon& corners, Point from) {
     const touching::Touched found = touching::touched(layer.grid, corners);
     const auto nearest = [&](Verdict wanted) -> std::optional<Blocker> {
@@ -201,7 +201,7 @@ inline std::vector<double> clearance(const Layer& layer, double most_m = 10.0, b
     require(grid, "no_squares", "layer '", layer.name, "' has a radial grid; squares are needed");
     const std::size_t width = grid->width, height = grid->height;
     const std::size_t reach = touching::limited(std::ceil(most_m / grid->edge_m() + 0.5), width + height);
-    // Cells up or down the column to the nearest one that is not free, at most `reach`.
+    // Cells up or down the column to the nearest cell that is not free, at most `reach`.
     std::vector<std::size_t> steps(layer.grid.cell_count());
     for (std::size_t cell = 0; cell < steps.size(); ++cell) {
         const Verdict verdict = asking::verdict_of(layer.class_of(cell));

@@ -1,8 +1,8 @@
 // The cells that a polygon touches, with the arithmetic of `client/src/footprint/touched.rs`.
 //
-// In: a grid and the checked corners of a polygon in the ego frame (metres). Out: every cell of which the polygon, its
-// border included, touches a point. A cell is touched by an edge, or lies wholly inside; then the line through its
-// centre crosses the polygon there.
+// In: a grid and the checked corners of a polygon in the ego frame (metres). Out: every cell that the polygon, its
+// border included, touches. A cell is touched by an edge, or lies wholly inside; then the line through its centre
+// crosses the polygon there.
 #pragma once
 
 #include "shapes.hpp"

@@ -34,7 +34,7 @@ impl World {
 }
 
 impl Hull {
-    /// True if the ground that the hull covers overlaps that of a shape.
+    /// True if the ground that the hull covers overlaps the ground that a shape covers.
     fn meets(&self, shape: &Shape) -> bool {
         let (outline, radius) = shape.outline();
         let corners = outline.map(|corner| self.in_own_frame(corner));

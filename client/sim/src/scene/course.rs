@@ -91,7 +91,7 @@ impl Course {
 /// A drive along a course: its direction, speed and start.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Drive {
-    /// The line followed.
+    /// Line on the ground that the vehicle follows.
     pub course: Arc<Course>,
     /// Metres along the line at time 0.
     pub start: f64,

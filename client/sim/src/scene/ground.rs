@@ -200,7 +200,7 @@ impl Ground {
         self.along.slope(x).hypot(self.across.slope(y))
     }
 
-    /// Reflectivity at (x, y), 0 to 255: that of the terrace, else of the ground.
+    /// Reflectivity at (x, y), 0 to 255: of the terrace, else of the ground.
     pub fn reflectivity(&self, x: f64, y: f64) -> u8 {
         let terrace = self.terraces.iter().rfind(|terrace| terrace.holds(x, y));
         terrace.map_or(self.reflectivity, |terrace| terrace.reflectivity)

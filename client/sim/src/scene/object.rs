@@ -11,7 +11,7 @@ use crate::noise::mixed;
 pub enum Kind {
     /// A building, or another solid block.
     Building,
-    /// A free-standing wall.
+    /// A wall that stands free on both sides.
     Wall,
     /// A car that is parked.
     ParkedCar,
@@ -19,7 +19,7 @@ pub enum Kind {
     MovingCar,
     /// A fence, closed or of slats.
     Fence,
-    /// A pole.
+    /// A thin upright pole, such as a lamp post.
     Pole,
     /// The trunk of a tree.
     Trunk,
@@ -32,7 +32,7 @@ pub enum Kind {
 /// A shape in the world frame, in metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
-    /// An upright box.
+    /// An upright box, turned about the vertical.
     Block {
         /// Coordinate x of the centre.
         x: f64,
@@ -60,7 +60,7 @@ pub enum Shape {
         /// Distance from slat to slat, and width of a slat. They are equal for a closed panel.
         slats: (f64, f64),
     },
-    /// An upright cylinder.
+    /// An upright cylinder, such as a pole or a trunk.
     Post {
         /// Coordinate x of the axis.
         x: f64,
@@ -80,9 +80,9 @@ pub enum Shape {
         y: f64,
         /// Coordinate z of the centre.
         z: f64,
-        /// Horizontal radius.
+        /// Radius of the ellipsoid in the horizontal, in metres.
         radius: f64,
-        /// Vertical radius.
+        /// Radius of the ellipsoid in the vertical, in metres.
         rise: f64,
         /// Height of the underside.
         underside: f64,
@@ -203,8 +203,8 @@ fn entry(from: f64, to: f64) -> Option<f64> {
 pub struct Object {
     /// Kind of the object.
     pub kind: Kind,
-    /// Shape of the object, in the world frame. That of a driving object is in its own frame (x forward, y left, z over
-    /// the ground).
+    /// Shape of the object, in the world frame. The shape of a driving object is in its own frame (x forward, y left, z
+    /// over the ground).
     pub shape: Shape,
     /// Reflectivity, 0 to 255.
     pub reflectivity: u8,

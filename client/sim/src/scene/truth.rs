@@ -1,7 +1,7 @@
 //! The truth about drivable ground, computed from the world itself, with which maps are compared.
 //!
-//! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits are
-//! those of the UT Austin thesis, section IV: a step of one unit (0.25 m), a clearance of 2.5 m, passages 3 m wide
+//! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits come
+//! from the UT Austin thesis, section IV: a step of one unit (0.25 m), a clearance of 2.5 m, passages 3 m wide
 //! (criterion 3).
 
 use nalgebra::{Isometry3, Point3};
@@ -12,7 +12,7 @@ use super::world::World;
 /// Class of a place, for a vehicle that stands in the middle of the raster.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Truth {
-    /// Beyond the raster.
+    /// A place beyond the raster; nothing is known of it.
     #[default]
     Outside,
     /// Free ground that the vehicle reaches through passages that are wide enough.

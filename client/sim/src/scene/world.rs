@@ -99,7 +99,7 @@ impl World {
         self
     }
 
-    /// An upright pole.
+    /// Adds an upright pole at (x, y), with radius and height over the ground, in metres.
     pub fn pole(self, x: f64, y: f64, radius: f64, height: f64) -> Self {
         let base = self.ground.height(x, y);
         self.with(Kind::Pole, 120, Shape::Post { x, y, radius, z: (base - 0.5, base + height) })

@@ -59,11 +59,11 @@ impl Default for PlaneUnit {
 pub struct PlaneScan {
     /// End of the scan, ns after the scene's beginning.
     pub end_ns: i64,
-    /// Forward, metres.
+    /// Coordinate of each point forward in the sensor frame, in metres.
     pub x: Vec<f32>,
     /// To the left, metres.
     pub y: Vec<f32>,
-    /// Up, metres.
+    /// Coordinate of each point upward in the sensor frame, in metres.
     pub z: Vec<f32>,
     /// Intensity, 0 to 1.
     pub intensity: Vec<f32>,

@@ -102,17 +102,17 @@ impl Scanner {
         Self { config, spec, calibration, beams }
     }
 
-    /// The sensor's configuration.
+    /// Configuration with which the sensor was made.
     pub fn config(&self) -> &ScannerConfig {
         &self.config
     }
 
-    /// The model's constants.
+    /// Constants of the sensor's model, from its manual.
     pub fn spec(&self) -> &'static ModelSpec {
         self.spec
     }
 
-    /// The sensor's calibration.
+    /// Calibration of the lasers, by which the sensor casts its rays.
     pub fn calibration(&self) -> &Calibration {
         &self.calibration
     }

@@ -24,7 +24,7 @@ const FIELDS = ["red", "green", "blue", "alpha"].map((name, offset) => ({ name, 
 const MAPS_KEPT = 8;
 const kept = new Map<string, Map<string, LiveMap>>();
 
-/** Of a map with several layers the one that ends the topic's name, else the first. Recordings have one in each map. */
+/** The layer whose name ends the topic's name, else the first layer. Recordings have one layer in each map. */
 function grid(message: MapMessage, { topic }: Event): Grid {
   const layer_message = message.layers.find(({ name }) => topic.endsWith(`/${name}`)) ?? message.layers[0];
   if (!layer_message) throw new Error("a map without layers");

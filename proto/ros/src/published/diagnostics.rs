@@ -8,22 +8,22 @@ use crate::cdr::{Header, Writer, length};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum DiagnosticLevel {
-    /// As it should.
+    /// The component works as it should.
     Ok = 0,
-    /// It works, but something is wrong.
+    /// The component works, but something is wrong.
     Warn = 1,
-    /// It does not work.
+    /// The component does not work.
     Error = 2,
 }
 
 /// The state of one component.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Diagnostic {
-    /// How well it works.
+    /// Level of the component.
     pub level: DiagnosticLevel,
     /// Name of the component.
     pub name: String,
-    /// What is wrong, in words.
+    /// The fault in words, or that there is none.
     pub message: String,
     /// Name of the hardware.
     pub hardware_id: String,

@@ -1,6 +1,6 @@
 //! The published message types: their names, their names in rmw_zenoh, and their definitions for MCAP files.
 //!
-//! Hashes are RIHS01 (REP-2016), equal from Iron to Jazzy. Definitions are those of `common_interfaces` and `geometry2`
+//! Hashes are RIHS01 (REP-2016), equal from Iron to Jazzy. Definitions come from `common_interfaces` and `geometry2`,
 //! without comments, each followed by the definitions of its members (MCAP's `ros2msg`).
 //!
 //! | file | in -> out |
@@ -13,7 +13,7 @@ pub mod diagnostics;
 pub mod markers;
 pub mod occupancy_grid;
 
-/// A message type.
+/// A message type that this server publishes: its names, its hash and its definition.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Published {
     package: &'static str,
@@ -40,7 +40,7 @@ impl Published {
     }
 }
 
-/// `nav_msgs/msg/OccupancyGrid`.
+/// `nav_msgs/msg/OccupancyGrid`: a layer as cells from 0 to 100.
 pub const OCCUPANCY_GRID: Published = Published::new(
     "nav_msgs",
     "OccupancyGrid",
@@ -48,7 +48,7 @@ pub const OCCUPANCY_GRID: Published = Published::new(
     include_str!("definitions/OccupancyGrid.msg"),
 );
 
-/// `tf2_msgs/msg/TFMessage`.
+/// `tf2_msgs/msg/TFMessage`: the ego pose as a transform.
 pub const TF_MESSAGE: Published = Published::new(
     "tf2_msgs",
     "TFMessage",
@@ -56,7 +56,7 @@ pub const TF_MESSAGE: Published = Published::new(
     include_str!("definitions/TFMessage.msg"),
 );
 
-/// `nav_msgs/msg/Odometry`.
+/// `nav_msgs/msg/Odometry`: the ego pose with velocities.
 pub const ODOMETRY: Published = Published::new(
     "nav_msgs",
     "Odometry",
@@ -64,7 +64,7 @@ pub const ODOMETRY: Published = Published::new(
     include_str!("definitions/Odometry.msg"),
 );
 
-/// `sensor_msgs/msg/PointCloud2`.
+/// `sensor_msgs/msg/PointCloud2`: points with named fields.
 pub const POINT_CLOUD2: Published = Published::new(
     "sensor_msgs",
     "PointCloud2",
@@ -72,7 +72,7 @@ pub const POINT_CLOUD2: Published = Published::new(
     include_str!("definitions/PointCloud2.msg"),
 );
 
-/// `geometry_msgs/msg/PoseArray`.
+/// `geometry_msgs/msg/PoseArray`: a list of poses in one frame.
 pub const POSE_ARRAY: Published = Published::new(
     "geometry_msgs",
     "PoseArray",
@@ -80,7 +80,7 @@ pub const POSE_ARRAY: Published = Published::new(
     include_str!("definitions/PoseArray.msg"),
 );
 
-/// `nav_msgs/msg/Path`.
+/// `nav_msgs/msg/Path`: a list of stamped poses in driving order.
 pub const PATH: Published = Published::new(
     "nav_msgs",
     "Path",
@@ -88,7 +88,7 @@ pub const PATH: Published = Published::new(
     include_str!("definitions/Path.msg"),
 );
 
-/// `visualization_msgs/msg/MarkerArray`.
+/// `visualization_msgs/msg/MarkerArray`: lines and texts to draw.
 pub const MARKER_ARRAY: Published = Published::new(
     "visualization_msgs",
     "MarkerArray",
@@ -96,7 +96,7 @@ pub const MARKER_ARRAY: Published = Published::new(
     include_str!("definitions/MarkerArray.msg"),
 );
 
-/// `std_msgs/msg/Bool`.
+/// `std_msgs/msg/Bool`: one truth value.
 pub const BOOL: Published = Published::new(
     "std_msgs",
     "Bool",
@@ -104,7 +104,7 @@ pub const BOOL: Published = Published::new(
     include_str!("definitions/Bool.msg"),
 );
 
-/// `diagnostic_msgs/msg/DiagnosticArray`.
+/// `diagnostic_msgs/msg/DiagnosticArray`: states of components, with keys and values.
 pub const DIAGNOSTIC_ARRAY: Published = Published::new(
     "diagnostic_msgs",
     "DiagnosticArray",

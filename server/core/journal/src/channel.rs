@@ -20,33 +20,33 @@ pub struct Channel {
 pub enum Content {
     /// Events of a vehicle's journal.
     Journal {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
     },
     /// Maps of a vehicle, with one layer each.
     Map {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
-        /// The layer's name.
+        /// Name of the layer in each map.
         layer: String,
     },
     /// Digests of a vehicle's maps, with one layer each.
     Digest {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
-        /// The layer's name.
+        /// Name of the layer in each map.
         layer: String,
     },
     /// Keyframes of a vehicle.
     Keyframe {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
     },
     /// Counts of the recorder.
     Counts,
     /// ROS 2 messages in CDR.
     Ros(Kind),
-    /// Anything else.
+    /// Any channel that is none of these.
     Other,
 }
 

@@ -1,8 +1,8 @@
 //! Two sets of maps of one drive -> what changed: cells by layer and class, gained and lost free space, the maps that
 //! changed most.
 //!
-//! The maps before are those of a recording. The maps after are computed from its events with another configuration,
-//! or are those of another recording. Maps with the same stamp are compared; maps that only one side has are counted.
+//! The maps before come from a recording. The maps after are computed from its events with another configuration, or
+//! come from another recording. Maps with the same stamp are compared; maps that only one side has are counted.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -25,14 +25,14 @@ mod computing;
 
 /// Where the maps after the change come from.
 pub enum After<'a> {
-    /// They are computed from the recorded events with another configuration.
+    /// Maps computed from the recorded events with another configuration.
     Config {
-        /// The configuration of each recorded vehicle, in any order; without tables, a vehicle uses the recorded ones.
+        /// Configuration of each recorded vehicle, in any order; without tables, a vehicle uses the recorded tables.
         given: &'a [RecordedVehicle],
-        /// The recorded configuration.
+        /// The configuration of each vehicle as recorded, in the recording's order.
         recorded: &'a [RecordedVehicle],
     },
-    /// They are those of this recording.
+    /// The maps of this recording.
     Recording(&'a Path),
 }
 
@@ -45,13 +45,13 @@ pub struct Comparison {
     pub after: u64,
     /// How a file is incomplete, with its name; `None` if both are whole.
     pub incomplete: Option<String>,
-    /// True if events are missing: the maps after them are not compared with those of a configuration, because they may
-    /// differ for that reason alone.
+    /// True if events are missing. The maps after them are not compared with maps of a configuration: the missing
+    /// events alone may make them differ.
     pub is_ended_by_loss: bool,
-    /// What changed, by vehicle and layer.
+    /// Changes by vehicle and layer.
     pub layers: BTreeMap<(String, String), LayerChange>,
-    /// The maps with the greatest share of changed cells: that of each layer, greatest first, then the second of each
-    /// layer, and so on.
+    /// The maps with the greatest share of changed cells: the first map of each layer, greatest share first, then the
+    /// second map of each layer, and so on.
     pub worst: Vec<MapChange>,
 }
 
@@ -74,7 +74,7 @@ pub struct LayerChange {
     pub gained_m2: f64,
     /// Area that was free and is no more, in square metres, in all maps.
     pub lost_m2: f64,
-    /// Number of cells by class before and class after; only those that changed.
+    /// Number of changed cells, by class before and class after.
     pub classes: BTreeMap<(String, String), u64>,
     /// The first cell whose class changed.
     pub first: Option<CellChange>,
@@ -98,7 +98,7 @@ pub struct CellChange {
 /// One map of one layer, before and after.
 #[derive(Clone, Debug)]
 pub struct MapChange {
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub vehicle: String,
     /// Sequence of the map, after the change.
     pub sequence: u64,
@@ -128,23 +128,23 @@ pub enum CompareError {
     /// A recorded map cannot be decoded.
     #[error("{}: a map of layer {layer} of vehicle {vehicle}: {source}", file.display())]
     Map {
-        /// The recording.
+        /// Path of the recording with the map.
         file: PathBuf,
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
-        /// The layer's name.
+        /// Name of the map's layer.
         layer: String,
-        /// The fault.
+        /// Why the map cannot be decoded.
         source: Box<MapError>,
     },
-    /// A recording has no maps to compare with those of another one.
+    /// A recording has no maps to compare with another recording's maps.
     #[error(
         "{} has no maps (recorder.maps = {:?}): `clearway replay` makes them with --record", file.display(), maps.as_str()
     )]
     NoMaps {
-        /// The recording.
+        /// Path of the recording without maps.
         file: PathBuf,
-        /// What it holds of them.
+        /// What the recording holds of the maps.
         maps: RecordedMaps,
     },
     /// The configuration does not fit the sensors of the recording: events name sensors by their place in the list.
@@ -152,9 +152,9 @@ pub enum CompareError {
         "the configuration does not fit {}: {what} {given}; recorded, in this order: {recorded}", file.display()
     )]
     Misfit {
-        /// The recording.
+        /// Path of the recording that the configuration does not fit.
         file: PathBuf,
-        /// What does not fit.
+        /// The kind of names that do not fit, in words.
         what: String,
         /// The names in the configuration.
         given: String,
@@ -192,7 +192,7 @@ impl MapChange {
     }
 }
 
-/// Compares the maps of the recording `before` with those of `after`; keeps the `worst` maps that changed most.
+/// Compares the maps of the recording `before` with the maps of `after`; keeps the `worst` maps that changed most.
 ///
 /// # Errors
 /// [`CompareError::Recording`] if a file cannot be read, [`CompareError::Misfit`] if the configuration names other
@@ -206,7 +206,7 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
         After::Config { given, recorded } => {
             let boot_id = recording.header().boot_id;
             let mut vehicles = pipelines(before, boot_id, given, recorded)?;
-            // Without recorded maps those of the recorded configuration are made too.
+            // Without recorded maps, the maps of the recorded configuration are computed too.
             let mut recorded = match recording.maps() {
                 RecordedMaps::Full => Vec::new(),
                 RecordedMaps::Digest | RecordedMaps::None => pipelines(before, boot_id, recorded, recorded)?,
@@ -359,7 +359,7 @@ impl Pairs {
         let map = OneLayer { sequence, stamp_ns, layer: decoded };
         let key = (vehicle, layer);
         let waiting = self.waiting.entry(key.clone()).or_default();
-        // The other side's maps that wait here are at least as new as this one.
+        // The other side's maps that wait here are at least as new as this map.
         match waiting[other].pop_front_if(|counterpart| counterpart.stamp_ns == stamp_ns) {
             None => waiting[side].push_back(map),
             Some(counterpart) => {
@@ -386,7 +386,7 @@ impl Pairs {
     }
 }
 
-/// Inserts a map that changed into the list of those that changed most, of at most `length`.
+/// Inserts a changed map into the list of the most changed maps, at most `length` maps.
 fn keep_worst(worst: &mut Vec<MapChange>, one: MapChange, length: usize) {
     if one.changed == 0 {
         return;

@@ -26,7 +26,7 @@ pub(super) struct LostPart {
 }
 
 impl LostPart {
-    /// A part of which no message is known.
+    /// A lost part without known messages or times.
     pub(super) fn new(bytes: (u64, u64), reason: String, is_loss: bool) -> Self {
         Self { bytes, reason, is_loss, chunk_ns: None, index_ns: None, messages: BTreeMap::new() }
     }

@@ -22,7 +22,7 @@ pub(super) enum FileRecords {
 }
 
 impl FileRecords {
-    /// Opens a file.
+    /// Opens a file: as a ROS 2 bag if its first bytes say so, else as MCAP.
     pub(super) fn open(path: &Path) -> Result<Self, RecordsError> {
         let mut file = open_to_read(path)?;
         let metadata = file.metadata()?;

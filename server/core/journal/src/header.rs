@@ -15,7 +15,7 @@ const METADATA: &str = "clearway";
 pub struct Header {
     /// Identifies the run of the server that made the maps; 0 in a file of another program.
     pub boot_id: u64,
-    /// The metadata `clearway`.
+    /// Keys and values of the metadata record `clearway`; empty in a file of another program.
     pub metadata: BTreeMap<String, String>,
     /// The effective configuration, TOML.
     pub config: Option<String>,
@@ -35,7 +35,7 @@ pub(super) enum Format {
 }
 
 impl Header {
-    /// Adds metadata, if it is that of a recording.
+    /// Adds the metadata `clearway` of a recording; ignores metadata of other programs.
     pub(super) fn add_metadata(&mut self, metadata: &Metadata) {
         if metadata.name == METADATA {
             self.metadata.clone_from(&metadata.metadata);

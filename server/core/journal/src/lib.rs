@@ -53,12 +53,12 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RecordedMaps {
-    /// The maps.
+    /// The encoded maps with all their layers.
     #[default]
     Full,
     /// The header and the SHA-256 of each layer: enough to verify that a replay makes the same bytes.
     Digest,
-    /// Nothing.
+    /// No maps and no digests.
     None,
 }
 
@@ -77,7 +77,7 @@ impl RecordedMaps {
 /// has one.
 #[derive(Clone, Debug)]
 pub struct RecordedVehicle {
-    /// The configuration.
+    /// Configuration of the vehicle's pipeline.
     pub config: VehicleConfig,
     /// The calibration tables, by sensor.
     pub tables: Vec<Option<Calibration>>,

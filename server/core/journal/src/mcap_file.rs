@@ -6,7 +6,7 @@
 //!
 //! | channel | schema | contents |
 //! |---|---|---|
-//! | `/<vehicle>/journal` | `clearway.v1.Event` | every event; at a keyframe also those that are in force |
+//! | `/<vehicle>/journal` | `clearway.v1.Event` | every event; at a keyframe also the events that are in force |
 //! | `/<vehicle>/map/<layer>` | `clearway.v1.Map` | the same bytes that zenoh carries |
 //! | `/<vehicle>/digest/<layer>` | `clearway.v1.MapDigest` | in place of the maps with `recorder.maps = "digest"` |
 //! | `/<vehicle>/keyframe` | `clearway.v1.Keyframe` | from where on the maps follow from this file's events alone |

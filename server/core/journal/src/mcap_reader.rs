@@ -39,11 +39,11 @@ const PACKAGES: [&str; 1] = ["clearway.v1."];
 /// One message of an MCAP file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Message {
-    /// The message's channel.
+    /// Channel of the message: topic, schema and encoding.
     pub channel: Arc<Channel>,
     /// Log time, ns since the Unix epoch.
     pub log_ns: u64,
-    /// The encoded message.
+    /// Payload in the encoding that the channel names.
     pub data: Bytes,
 }
 
@@ -95,26 +95,26 @@ pub enum McapReadError {
     /// The file cannot be read.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The file.
+        /// Path of the file that cannot be read.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The file does not start as an MCAP file does.
     #[error("{}: not an MCAP file: it does not start with the magic bytes", file.display())]
     NotMcap {
-        /// The file.
+        /// Path of the file that is not MCAP.
         file: PathBuf,
     },
     /// A later version of clearway wrote the file.
     #[error("{}: a recording with {found}; this clearway reads {known}: use the version that wrote it, {by}, or a later one",
         file.display())]
     Version {
-        /// The file.
+        /// Path of the file that is too new.
         file: PathBuf,
-        /// What the file has.
+        /// The format or message schema of the file, in words.
         found: String,
-        /// What this version reads.
+        /// The formats or schemas that this clearway reads, in words.
         known: String,
         /// The version that wrote the file.
         by: String,
@@ -189,7 +189,7 @@ impl McapReader {
         })
     }
 
-    /// The file's path.
+    /// Path of the file, as given to open it.
     pub fn file(&self) -> &Path {
         &self.file
     }
@@ -224,7 +224,7 @@ impl McapReader {
         self.records.lost().iter().filter(|part| part.is_loss).count()
     }
 
-    /// What `clearway repair` could not read of the damaged file, if it wrote this one: the losses so far, in file
+    /// What `clearway repair` could not read of the damaged file, if it wrote this file: the losses so far, in file
     /// order. The file itself is whole.
     pub fn repaired(&self) -> &[String] {
         &self.repaired

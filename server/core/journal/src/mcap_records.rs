@@ -2,7 +2,7 @@
 //! that cannot be read.
 //!
 //! Records are read one after the other by their lengths. Behind a damaged record the reader goes on at the end of the
-//! record if the head of another one is there, else at the next record that the summary of the file names. Without a
+//! record if the head of another record is there, else at the next record that the summary of the file names. Without a
 //! summary, a damaged length costs the rest of the file.
 
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
@@ -376,7 +376,7 @@ impl McapRecords {
     }
 }
 
-/// True for the kinds of the specification and for private ones.
+/// True for the kinds of the specification and for private kinds.
 fn is_opcode(opcode: u8) -> bool {
     (op::HEADER..=op::DATA_END).contains(&opcode) || opcode >= PRIVATE
 }

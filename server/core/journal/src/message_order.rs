@@ -38,7 +38,7 @@ pub(super) struct MessageOrder {
     next: BTreeMap<String, u64>,
     /// The vehicles whose events a keyframe repeats now.
     repeating: BTreeSet<String>,
-    /// The topics of which messages were lost since their last one.
+    /// The topics with messages lost since their last read message.
     with_loss: BTreeSet<String>,
     /// Number of messages so far.
     messages: u64,
@@ -113,7 +113,8 @@ impl MessageOrder {
         }
     }
 
-    /// How the order is not that of the recorder, which `has_dropped` messages.
+    /// How the order differs from the recorder's order, `None` if it does not. Gaps are allowed if the recorder
+    /// `has_dropped` messages.
     pub(super) fn fault(&self, has_dropped: bool) -> Option<String> {
         let gaps = Some(&self.gaps).filter(|_| !has_dropped);
         let found = || gaps.into_iter().chain([&self.moved]).filter(|places| places.count > 0);

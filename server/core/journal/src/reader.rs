@@ -23,47 +23,47 @@ use crate::encode::{EventDecodeError, event_from_bytes};
 pub enum RecordedMessage {
     /// An event of `/<vehicle>/journal`.
     Event {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
         /// The event as the pipeline processed it.
         event: Event,
     },
     /// A map of `/<vehicle>/map/<layer>`.
     Map {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
-        /// The layer's name.
+        /// Name of the map's layer.
         layer: String,
         /// An encoded `clearway.v1.Map` with this one layer.
         bytes: Bytes,
     },
     /// A digest of `/<vehicle>/digest/<layer>`.
     Digest {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
-        /// The layer's name.
+        /// Name of the map's layer.
         layer: String,
         /// The header of the map, and the SHA-256 of its bytes.
         digest: v1::MapDigest,
     },
     /// A mark of `/<vehicle>/keyframe`.
     Keyframe {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
-        /// The mark.
+        /// The keyframe: a new pipeline warms up, or replaces the old one.
         keyframe: v1::Keyframe,
     },
     /// What the recorder has written and dropped so far, of `/recorder/counts`.
     Counts(v1::RecordingCounts),
     /// A ROS 2 message.
     Ros {
-        /// The topic.
+        /// Topic of the message.
         topic: String,
-        /// The type.
+        /// Type of the message.
         kind: Kind,
         /// Log time, ns since the Unix epoch.
         log_ns: i64,
-        /// The message, CDR.
+        /// The message in CDR, with its header.
         bytes: Bytes,
     },
 }
@@ -77,7 +77,7 @@ pub enum RecordingError {
     /// A message of a journal is not an event.
     #[error("{}: {topic}: {source}", file.display())]
     Event {
-        /// The recording.
+        /// Path of the recording.
         file: PathBuf,
         /// The topic of the journal.
         topic: String,
@@ -87,7 +87,7 @@ pub enum RecordingError {
     /// The file has no configuration: another program wrote it, it was cut before its first message, or it is damaged.
     #[error("{}: no attachment config.toml: {reason}", file.display())]
     NoConfig {
-        /// The recording.
+        /// Path of the recording.
         file: PathBuf,
         /// Why it has none, as far as known.
         reason: String,
@@ -98,11 +98,11 @@ pub enum RecordingError {
     /// A recorded calibration is missing or invalid.
     #[error("{}: attachment {name}: {reason}", file.display())]
     Calibration {
-        /// The recording.
+        /// Path of the recording.
         file: PathBuf,
         /// The name of the attachment.
         name: String,
-        /// The fault.
+        /// Why the calibration cannot be used.
         reason: String,
     },
 }
@@ -121,7 +121,7 @@ impl Beginning {
     /// Reads a recording up to its first map.
     ///
     /// # Errors
-    /// As [`RecordingReader::open`], and those of its messages.
+    /// As [`RecordingReader::open`], and the errors of the recording's messages.
     pub fn of(file: &Path) -> Result<Self, RecordingError> {
         let mut beginning = Self::default();
         for message in RecordingReader::open(file)? {
@@ -165,7 +165,7 @@ impl RecordingReader {
         Ok(Self { reader: McapReader::from_source(file, source)?, has_ended: false })
     }
 
-    /// The file's path.
+    /// Path of the file, as given to open it.
     pub fn file(&self) -> &Path {
         self.reader.file()
     }
@@ -195,12 +195,12 @@ impl RecordingReader {
         self.reader.damages()
     }
 
-    /// What a repair could not read of the damaged file, if this one is repaired: the losses so far.
+    /// What a repair could not read of the damaged file, if this file is repaired: the losses so far.
     pub fn repaired(&self) -> &[String] {
         self.reader.repaired()
     }
 
-    /// Number of lost parts so far, of this file and of the one from which it was repaired.
+    /// Number of lost parts so far, of this file and of the file from which it was repaired.
     pub fn loss_count(&self) -> usize {
         self.reader.loss_count() + self.repaired().len()
     }
@@ -273,12 +273,12 @@ impl RecordingReader {
             }
             Content::Digest { vehicle, layer } => {
                 let (vehicle, layer) = (vehicle.clone(), layer.clone());
-                // One that cannot be decoded differs from every map.
+                // A digest that cannot be decoded differs from every map.
                 let digest = v1::MapDigest::decode(bytes).unwrap_or_default();
                 Some(Ok(RecordedMessage::Digest { vehicle, layer, digest }))
             }
             Content::Keyframe { vehicle } => {
-                // One that cannot be decoded leaves the maps after it unjudged.
+                // A keyframe that cannot be decoded leaves the maps after it unjudged.
                 let keyframe = v1::Keyframe::decode(bytes).ok()?;
                 Some(Ok(RecordedMessage::Keyframe { vehicle: vehicle.clone(), keyframe }))
             }

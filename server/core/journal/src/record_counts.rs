@@ -1,5 +1,5 @@
-//! The records of an MCAP file -> how many it has, and how many it should have by its own counts: those of its summary,
-//! and of a recording those of the recorder.
+//! The records of an MCAP file -> how many it has, and how many it should have by the counts in its summary and, in a
+//! recording, by the recorder's counts.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use mcap::records::{Record, Statistics};
 
 use crate::counted::counted;
 
-/// The numbers of records that were read, and those that the file states.
+/// The numbers of records that were read, and the numbers that the file states.
 #[derive(Default)]
 pub(super) struct RecordCounts {
     messages: BTreeMap<u16, u64>,
@@ -28,7 +28,7 @@ struct Missing {
 }
 
 impl RecordCounts {
-    /// Counts a record.
+    /// Counts a message, an attachment or a metadata record, and remembers the summary's counts.
     pub(super) fn add(&mut self, record: &Record<'_>) {
         match record {
             Record::Message { header, .. } => *self.messages.entry(header.channel_id).or_default() += 1,
@@ -39,13 +39,13 @@ impl RecordCounts {
         }
     }
 
-    /// Adds counts of the recorder; only the last ones, of the closed file, are complete.
+    /// Adds counts of the recorder; only the last counts, of the closed file, are complete.
     pub(super) fn add_recorder(&mut self, counts: v1::RecordingCounts) {
         self.recorder = Some(counts).filter(|counts| counts.closed);
     }
 
-    /// Ends the counting. The counts of the summary can be used from here on, if they are `sound`; those of the
-    /// recorder unless a repaired file has them of the file before.
+    /// Ends the counting. From here on the summary's counts can be used if they `are_sound`, and the recorder's counts
+    /// unless the file `is_repaired`: then they count the damaged file.
     pub(super) fn end(&mut self, are_sound: bool, is_repaired: bool) {
         self.has_ended = true;
         self.stated = self.stated.take().filter(|_| are_sound);
@@ -67,7 +67,7 @@ impl RecordCounts {
         self.recorder.iter().flat_map(|counts| &counts.topics).any(|topic| topic.dropped > 0)
     }
 
-    /// The topics of which more or fewer messages were read than the file states; `None` if it does not state it.
+    /// The topics whose number of read messages differs from the stated number; `None` if the file states no numbers.
     fn differing(&self, topic: impl Fn(u16) -> String) -> Option<Vec<Missing>> {
         let mut read: BTreeMap<String, u64> = BTreeMap::new();
         self.messages.iter().for_each(|(id, count)| *read.entry(topic(*id)).or_default() += count);
@@ -105,7 +105,7 @@ impl RecordCounts {
         has_others && self.missing_messages(topic) == Some(0)
     }
 
-    /// What is wrong with the numbers of messages, if the damaged parts of the file name this many lost ones.
+    /// What is wrong with the numbers of messages, if the damaged parts of the file name this many lost messages.
     pub(super) fn faults(&self, named: u64, topic: impl Fn(u16) -> String) -> Vec<String> {
         let differing = self.differing(topic).unwrap_or_default();
         let more = differing.iter().filter(|of| of.read > of.stated);

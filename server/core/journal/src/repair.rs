@@ -54,35 +54,35 @@ pub enum RepairError {
     /// No message of the damaged file can be read.
     #[error("{}: no message can be read{}", file.display(), incomplete.as_ref().map_or(String::new(), |of| format!(": {of}")))]
     Nothing {
-        /// The damaged file.
+        /// Path of the damaged file.
         file: PathBuf,
-        /// How it is incomplete.
+        /// How the damaged file is incomplete; `None` if it is whole.
         incomplete: Option<String>,
     },
     /// The new file cannot be created or moved to its name.
     #[error("{}: {source}", file.display())]
     Create {
-        /// The new file.
+        /// Path of the new file.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The new file cannot be written.
     #[error("{}: {source}", file.display())]
     Write {
-        /// The new file.
+        /// Path of the new file.
         file: PathBuf,
-        /// The reason.
+        /// Error of the MCAP writer.
         source: McapError,
     },
     /// The new file does not hold what was written to it.
     #[error("{}: read again, it has {found} messages and not {written}", file.display())]
     Differs {
-        /// The new file.
+        /// Path of the new file.
         file: PathBuf,
         /// Number of messages that were written.
         written: u64,
-        /// Number of messages that it has.
+        /// Number of messages that the new file has.
         found: u64,
     },
 }
@@ -186,7 +186,7 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
     Ok(report)
 }
 
-/// The texts of those damages that are losses.
+/// The texts of the damages that are losses.
 fn losses(damages: &[Damage]) -> Vec<String> {
     damages.iter().filter(|damage| damage.is_loss).map(ToString::to_string).collect()
 }

@@ -1,10 +1,10 @@
 //! Verifies a recording: are the recorded maps the maps of the recorded events?
 //!
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
-//! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one.
+//! journal, and compares the bytes of each map with the recorded map's bytes, or their digest with the recorded digest.
 //! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which
-//! the file lacks are counted as unjudged: those after a gap, until the next keyframe; and if messages of the file are
-//! missing or not in their place, all recorded maps without a computed one, and the reverse.
+//! the file lacks are counted as unjudged: the maps after a gap, until the next keyframe; and if messages of the file
+//! are missing or not in their place, all recorded maps without a computed map, and the reverse.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -29,7 +29,7 @@ mod difference;
 use difference::first_difference;
 pub use difference::{Difference, DifferenceKind};
 
-/// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
+/// Greatest number of differences in a report; all are counted. Ours: the first differences explain the others.
 const DIFFERENCES_MAX: usize = 20;
 
 /// The result of a verification.
@@ -39,11 +39,11 @@ pub struct Report {
     pub events: u64,
     /// What the recording holds of the maps. Without any, only its events are checked.
     pub recorded: RecordedMaps,
-    /// Number of recorded maps or digests, of one layer each, that equal those of the computed map byte for byte.
+    /// Number of recorded maps or digests, of one layer each, that equal the computed map or digest byte for byte.
     pub equal: u64,
     /// Number of maps computed from the events.
     pub maps: u64,
-    /// Number of cells of the recorded maps that have a computed map: those of their layers' grids.
+    /// Number of cells in the grids of all recorded maps that have a computed map.
     pub cells: u64,
     /// True if a crash cut the file; then the part before the cut is verified.
     pub cut: bool,
@@ -62,12 +62,12 @@ pub struct Report {
     pub damages: Vec<Damage>,
     /// How the file is incomplete; `None` if it is whole.
     pub incomplete: Option<String>,
-    /// What `clearway repair` could not read of the damaged file, if it wrote this one. The events and maps that are
+    /// What `clearway repair` could not read of the damaged file, if it wrote this file. The events and maps that are
     /// lost there are no differences.
     pub repaired: Vec<String>,
     /// Version of clearway that recorded the file, as its metadata states it; empty without one.
     pub made_by: String,
-    /// The first differences.
+    /// The first differences, in file order.
     pub differences: Vec<Difference>,
     /// Number of all differences.
     pub different: u64,
@@ -127,7 +127,7 @@ struct VehicleReplay {
     records: RecordedMaps,
     /// Sequence of the next event; `None` before the first one.
     next_event: Option<u64>,
-    /// True if events are missing before this one, until the next keyframe; the maps need not equal the computed ones.
+    /// True if events are missing, until the next keyframe; the recorded maps need not equal the computed maps.
     lacks_events: bool,
     /// Computed maps that are not compared yet, by sequence and layer.
     computed: BTreeMap<(u64, String), Bytes>,
@@ -220,7 +220,7 @@ pub fn verify(mut recording: RecordingReader, vehicles: Vec<RecordedVehicle>) ->
         report.incomplete.get_or_insert(differs);
     }
     let mut has_changed = recording.lacks_messages() || recording.loss_count() > 0;
-    // After a gap the maps that are computed have other numbers than the recorded ones.
+    // After a gap the maps that are computed have other numbers than the recorded maps.
     let is_early = |replay: &VehicleReplay| replay.extra.iter().any(|map| replay.computed.contains_key(map));
     if !has_changed && replays.iter().any(is_early) {
         has_changed = true;
@@ -294,7 +294,7 @@ impl VehicleReplay {
         }
     }
 
-    /// Compares a recorded digest with that of the computed layer.
+    /// Compares a recorded digest with the computed layer's digest.
     fn compare_digest(&mut self, layer: &str, digest: v1::MapDigest, report: &mut Report) {
         let v1::MapDigest { header, sha256: recorded } = digest;
         let sequence = header.as_ref().map_or(u64::MAX, |header| header.sequence);

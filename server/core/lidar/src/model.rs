@@ -1,6 +1,6 @@
 //! The Velodyne models and their properties: lasers, blocks, timing, resolution.
 //!
-//! All values are those of the manuals, none is measured here. The decoder uses them, and so does the encoder of a
+//! All values come from the manuals, none is measured here. The decoder uses them, and so does the encoder of a
 //! simulated sensor. Sources: HDL-64E S2/S3 manual (63-HDL64ES3 rev K, appendices E to G), HDL-32E application note
 //! 63-9277, VLP-16 manual 63-9243 rev E, VLP-32C manual 63-9325, VLS-128 manual 63-9480, and VeloView for the pauses
 //! between groups of lasers of a VLS-128.
@@ -13,21 +13,21 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Model {
-    /// HDL-64E S1.
+    /// HDL-64E S1: 64 lasers.
     Hdl64eS1,
-    /// HDL-64E S2 (and S2.1).
+    /// HDL-64E S2 (and S2.1): 64 lasers.
     Hdl64eS2,
-    /// HDL-64E S3.
+    /// HDL-64E S3: 64 lasers.
     Hdl64eS3,
-    /// HDL-32E.
+    /// HDL-32E: 32 lasers.
     Hdl32e,
-    /// VLP-16 (Puck, Puck LITE).
+    /// VLP-16 (Puck, Puck LITE): 16 lasers.
     Vlp16,
-    /// Puck Hi-Res.
+    /// Puck Hi-Res: 16 lasers, closer together than in a VLP-16.
     PuckHiRes,
-    /// VLP-32C (Ultra Puck).
+    /// VLP-32C (Ultra Puck): 32 lasers.
     Vlp32c,
-    /// VLS-128 (Alpha Prime).
+    /// VLS-128 (Alpha Prime): 128 lasers.
     Vls128,
 }
 
@@ -65,7 +65,7 @@ pub const S1_FLAGS: [u16; 4] = [FLAG_LASERS_32, FLAG_LASERS_0, FLAG_LASERS_0, FL
 /// The properties of a model, from its manual.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModelSpec {
-    /// The model.
+    /// Model that these properties describe.
     pub model: Model,
     /// Name as Velodyne writes it.
     pub name: &'static str,
@@ -80,7 +80,7 @@ pub struct ModelSpec {
     pub firing_period_ns: u32,
     /// Time from one firing to the next in dual-return mode, in ns.
     pub firing_period_dual_ns: u32,
-    /// Values of byte 1205 that sensors of this model send; the first is that of the manual. Empty for an HDL-64E,
+    /// Values of byte 1205 that sensors of this model send; the first value is the manual's. Empty for an HDL-64E,
     /// whose last two bytes are status bytes.
     pub model_bytes: &'static [u8],
     /// True if the model has a dual-return mode.
@@ -98,7 +98,7 @@ pub struct ModelSpec {
 }
 
 impl Model {
-    /// All models.
+    /// All models, in the order of the enum.
     pub const ALL: [Model; 8] = [
         Model::Hdl64eS1,
         Model::Hdl64eS2,

@@ -80,7 +80,7 @@ impl Sensor {
     /// The state of the sensor is then as if the datagram had not arrived.
     /// - [`DatagramError::Length`], [`DatagramError::BlockFlag`], [`DatagramError::Azimuth`] or [`DatagramError::Nmea`]
     ///   if the datagram cannot be parsed.
-    /// - [`DatagramError::BlockFlag`] or [`DatagramError::Model`] if it is of no model, or of another one.
+    /// - [`DatagramError::BlockFlag`] or [`DatagramError::Model`] if it is of no model, or of another model.
     /// - [`DatagramError::Duplicate`], [`DatagramError::Late`] or [`DatagramError::DeviceTime`] if it is a copy, too
     ///   late, or its device time does not follow.
     /// - [`DatagramError::Calibration`] if the configured calibration does not fit the model.
@@ -179,7 +179,7 @@ impl Sensor {
     /// may follow.
     pub fn finish(&mut self) -> Option<&Revolution> {
         if self.decoder.is_none() && !self.waiting.is_empty() {
-            // There are too few packets to measure their rate, so the model is that of the byte.
+            // There are too few packets to measure their rate, so the model byte decides.
             self.start(Model::Hdl32e, None).ok()?;
         }
         let decoder = self.decoder.as_mut()?;

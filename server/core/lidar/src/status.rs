@@ -27,7 +27,7 @@ pub struct SensorStatus {
     pub return_mode: Option<ReturnMode>,
     /// Rate of rotation, in revolutions per minute: configured, or measured over the newest revolution.
     pub rpm: Option<f32>,
-    /// Number of decoded data packets, without those that wait.
+    /// Number of decoded data packets, without packets that wait.
     pub packets: u64,
     /// Number of data packets that wait until the model is known, or until the packets before them arrive.
     pub packets_waiting: usize,

@@ -23,7 +23,7 @@ pub enum UnknownNameError {
     /// No vehicle has this name.
     #[error("vehicle {name:?} is not known; known: {known}")]
     Vehicle {
-        /// The requested name.
+        /// The requested name, which no vehicle has.
         name: String,
         /// The names of all vehicles, separated by commas.
         known: String,
@@ -31,9 +31,9 @@ pub enum UnknownNameError {
     /// No sensor of the vehicle has this name, or the name is empty and there is not exactly one sensor.
     #[error("sensor {name:?} is not known; vehicle {vehicle} has: {known}")]
     Sensor {
-        /// The requested name.
+        /// The requested name, which no sensor of the vehicle has.
         name: String,
-        /// The vehicle's name.
+        /// Name of the vehicle whose sensors were searched.
         vehicle: String,
         /// The names of the vehicle's sensors, separated by commas.
         known: String,
@@ -41,9 +41,9 @@ pub enum UnknownNameError {
     /// No layer of the vehicle's maps has this name.
     #[error("layer {name:?} is not known; vehicle {vehicle} has: {known}")]
     Layer {
-        /// The requested name.
+        /// The requested name, which no layer has.
         name: String,
-        /// The vehicle's name.
+        /// Name of the vehicle whose layers were searched.
         vehicle: String,
         /// The names of the layers, separated by commas.
         known: String,

@@ -66,7 +66,7 @@ pub fn write_new(file: &Path, bytes: &[u8]) -> Result<()> {
     create_new(file)?.write_all(bytes).map_err(|error| wrong(file, error))
 }
 
-/// Writes a file; one that exists is replaced.
+/// Writes a file; an existing file is replaced.
 ///
 /// # Errors
 /// If it cannot be written.

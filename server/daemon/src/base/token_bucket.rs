@@ -12,7 +12,7 @@ pub struct TokenBucket {
 }
 
 impl TokenBucket {
-    /// A full bucket.
+    /// A full bucket of `most` tokens, refilled at `per_second` tokens a second.
     pub fn new(most: u32, per_second: u32) -> Self {
         Self { most, per_second, left: most, filled: Instant::now() }
     }

@@ -10,7 +10,7 @@ use super::error::ValueError;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Connections {
-    /// Most connections at once, at each listener; further ones are refused with RESOURCE_EXHAUSTED or 503.
+    /// Most connections at once, at each listener; further connections are refused with RESOURCE_EXHAUSTED or 503.
     pub max: usize,
     /// Most connections of one address at once, at each listener. IPv6: of one network with a prefix of 64 bits.
     pub per_address_max: usize,
@@ -59,21 +59,21 @@ impl Default for Connections {
     }
 }
 
-/// What listens on an address.
+/// A kind of listener on an address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Service {
-    /// gRPC.
+    /// The gRPC server.
     Grpc,
     /// The page and its WebSocket.
     Page,
     /// The listener of `/healthz`, `/readyz` and `/metrics` alone.
     Metrics,
-    /// Foxglove's WebSocket.
+    /// The WebSocket server for Foxglove.
     Foxglove,
-    /// zenoh.
+    /// The endpoint on which zenoh listens.
     Zenoh,
-    /// Datagrams.
+    /// The UDP socket for datagrams of sensors.
     Udp,
 }
 

@@ -32,7 +32,7 @@ impl ValueError {
 pub enum Origin {
     /// In the configuration file.
     File {
-        /// The file.
+        /// Path of the configuration file.
         file: PathBuf,
         /// Number of the line, if it is known.
         line: Option<usize>,
@@ -68,7 +68,7 @@ pub enum ConfigError {
         file.display()
     )]
     Read {
-        /// The configuration file.
+        /// Path of the configuration file.
         file: PathBuf,
         /// Error of the system.
         source: std::io::Error,
@@ -76,7 +76,7 @@ pub enum ConfigError {
     /// The text is not TOML. The source shows line and column.
     #[error("configuration {}: {source}", file.display())]
     Syntax {
-        /// The configuration file.
+        /// Path of the configuration file.
         file: PathBuf,
         /// Position and reason.
         source: Box<toml::de::Error>,
@@ -106,9 +106,9 @@ pub enum ConfigError {
     /// No vehicle has a name that was asked for.
     #[error("configuration {}: there is no vehicle {name}; its vehicles: {known}", file.display())]
     UnknownVehicle {
-        /// The configuration file.
+        /// Path of the configuration file.
         file: PathBuf,
-        /// The name.
+        /// The name that was asked for.
         name: String,
         /// The names of the vehicles, separated by commas.
         known: String,
@@ -146,7 +146,7 @@ pub enum ConfigError {
     /// A file that the configuration names (a calibration, a certificate) cannot be used.
     #[error("configuration {}: {key} = {}: {reason}", file.display(), named.display())]
     File {
-        /// The configuration file.
+        /// Path of the configuration file.
         file: PathBuf,
         /// Path of the key.
         key: String,

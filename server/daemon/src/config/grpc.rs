@@ -12,11 +12,11 @@ use crate::base::file_advice::{advised, read_text};
 
 use super::error::{ConfigError, ValueError, beside};
 
-/// The table `[grpc]`.
+/// The table `[grpc]`: address, certificates and access rules of the gRPC server.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Grpc {
-    /// True if it is served.
+    /// True if gRPC is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
@@ -41,7 +41,7 @@ impl Default for Grpc {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tls {
-    /// The server's certificate, and the intermediate ones between it and the CA.
+    /// The server's certificate, and the intermediate certificates between it and the CA.
     pub certificate: PathBuf,
     /// Its private key. A recording holds the path only.
     pub key: PathBuf,
@@ -103,7 +103,7 @@ impl Grpc {
             let allowed = "no name without grpc.tls.client_ca, the CA of the clients' certificates";
             return Err(ValueError::new("grpc.access", name, allowed));
         }
-        // A misspelt name would leave the one that was meant without a limit.
+        // A misspelt name would leave the client that was meant without a limit.
         let has_access = |name: &String| {
             readers.iter().chain(ingesters).chain(operators).chain(tokens.keys()).any(|other| other == name)
         };

@@ -1,4 +1,4 @@
-//! The layers of a configuration, of which the later ones replace keys of the earlier ones: `[vehicle_defaults]`, each
+//! The layers of a configuration; later layers replace keys of earlier layers: `[vehicle_defaults]`, each
 //! `[[vehicle]]`, environment variables and `--set`. Each value keeps the place at which it was given.
 
 use std::collections::BTreeMap;
@@ -28,7 +28,7 @@ pub(super) enum Node {
     List(Vec<Node>),
 }
 
-/// The root table.
+/// The root table, by key.
 #[derive(Clone, Debug)]
 pub(super) struct Layers(pub BTreeMap<String, Node>);
 
@@ -100,7 +100,7 @@ impl Layers {
     }
 
     /// Gives every vehicle the keys of `[vehicle_defaults]` that it does not have itself. A vehicle without sensors has
-    /// those of the defaults; a sensor of its own has the keys of the default sensor with its name.
+    /// the default sensors; a sensor of its own has the keys of the default sensor with its name.
     ///
     /// # Errors
     /// The value and what is allowed, if `vehicle_defaults` is no table, or names a vehicle.

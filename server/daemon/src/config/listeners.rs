@@ -24,7 +24,7 @@ pub struct Route {
 pub struct Listener {
     /// Address and port to bind.
     pub at: SocketAddr,
-    /// Receive buffer, in bytes: the largest that one of its vehicles requests.
+    /// Receive buffer, in bytes: the largest buffer requested by its vehicles.
     pub receive_buffer_bytes: usize,
     /// Multicast groups to join, each with its interface.
     pub groups: BTreeSet<(IpAddr, String)>,
@@ -73,7 +73,7 @@ pub fn listeners(vehicles: &[Vehicle]) -> Vec<Listener> {
         for (source, sensor) in (0_u16..).zip(&vehicle.sensors) {
             let own = udp.ports.get(&sensor.name);
             let named = own.is_some() || udp.from.contains_key(&sensor.name);
-            // If any sensor is named, the unnamed ones get their data from other sources.
+            // If any sensor is named, the unnamed sensors get their data from other sources.
             let any_named = !udp.from.is_empty() || !udp.ports.is_empty();
             if any_named && !named {
                 continue;

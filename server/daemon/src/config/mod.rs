@@ -56,7 +56,7 @@ pub const COMMENTED: &str = include_str!("../../../../deploy/clearway.toml");
 /// factory's table.
 pub type Calibrations = Vec<Vec<Option<Calibration>>>;
 
-/// The whole configuration.
+/// The whole configuration, as read from the file with its overrides.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -78,7 +78,7 @@ pub struct Config {
     /// What the peers of all TCP listeners may cost.
     #[serde(default)]
     pub connections: Connections,
-    /// The recording.
+    /// What is recorded, where to and for how long.
     #[serde(default)]
     pub recorder: Recorder,
     /// Where finished parts of the recording go.
@@ -92,11 +92,11 @@ pub struct Config {
     pub vehicles: Vec<Vehicle>,
 }
 
-/// The table `[page]`.
+/// The table `[page]`: the page, its WebSocket, `/healthz`, `/readyz` and `/metrics`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Page {
-    /// True if it is served.
+    /// True if the page is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
@@ -129,7 +129,7 @@ impl Page {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Metrics {
-    /// True if it is served.
+    /// True if the listener of the metrics is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
@@ -145,7 +145,7 @@ impl Default for Metrics {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Foxglove {
-    /// True if it is served.
+    /// True if the WebSocket for Foxglove is served.
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
@@ -383,8 +383,8 @@ fn refused(refusal: Refusal, origin: Origin) -> ConfigError {
 }
 
 impl Config {
-    /// The configuration with those of `old`'s values that a running server can replace: certificates, tokens, roles
-    /// and limits. It equals `old` if nothing else differs.
+    /// This configuration with `old`'s certificates, tokens, roles and limits, which a running server can replace. It
+    /// equals `old` if nothing else differs.
     pub fn without_reloaded(mut self, old: &Self) -> Self {
         self.grpc.tls.clone_from(&old.grpc.tls);
         self.grpc.access.clone_from(&old.grpc.access);

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
 
-/// The table `[recorder]`.
+/// The table `[recorder]`: what is recorded, where to and for how long.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Recorder {
@@ -47,7 +47,7 @@ pub struct Recorder {
     /// True if a file that exists stays, and the recording gets the next free name; never configured, only by `serve`.
     #[serde(skip)]
     pub is_numbered: bool,
-    /// The configured file, if `file` is another name because that one is taken.
+    /// The configured file, if `file` is another name because the configured name is taken.
     #[serde(skip)]
     pub family: PathBuf,
 }

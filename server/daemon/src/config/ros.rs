@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
 
-/// Greatest `ROS_DOMAIN_ID`.
+/// Greatest `ROS_DOMAIN_ID` that ROS 2 allows.
 pub(super) const DOMAIN_MAX: u32 = 232;
 
-/// The table `[vehicle.ros]`.
+/// The table `[vehicle.ros]`: subscriptions of ROS 2 topics over zenoh.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ros {
-    /// `ROS_DOMAIN_ID`.
+    /// The `ROS_DOMAIN_ID` of the subscribed topics, 0 to 232.
     pub domain: u32,
     /// Topic of odometry or stamped poses; empty: poses come from tf.
     pub pose: String,

@@ -5,7 +5,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use serde::{Deserialize, Serialize};
 
-/// The table `[vehicle.udp]`.
+/// The table `[vehicle.udp]`: the sockets that receive datagrams of the sensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Udp {
@@ -47,9 +47,9 @@ impl Default for Udp {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ports {
-    /// Port of its data packets.
+    /// Port that receives the sensor's data packets.
     pub data: u16,
-    /// Port of its telemetry.
+    /// Port that receives the sensor's telemetry.
     pub telemetry: u16,
 }
 

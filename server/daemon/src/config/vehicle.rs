@@ -37,7 +37,7 @@ pub struct Vehicle {
     /// Which layers are made, and with which parameters.
     #[serde(default)]
     pub maps: MapsConfig,
-    /// The sensors.
+    /// The sensors, in the order in which events name them.
     #[serde(rename = "sensor")]
     pub sensors: Vec<SensorConfig>,
 }
@@ -60,7 +60,7 @@ impl Vehicle {
     }
 }
 
-/// The table `[vehicle.ingest]`.
+/// The table `[vehicle.ingest]`: limits of observations over gRPC and zenoh.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ingest {

@@ -11,7 +11,7 @@ use super::error::ValueError;
 use super::ros::{DOMAIN_MAX, Ros, is_topic};
 use super::vehicle::Vehicle;
 
-/// The table `[zenoh]`.
+/// The table `[zenoh]`: the zenoh session of the server.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Zenoh {
@@ -130,13 +130,13 @@ impl Default for Fleet {
     }
 }
 
-/// The table `[zenoh.ros2]`.
+/// The table `[zenoh.ros2]`: maps as ROS 2 topics over zenoh.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ros2 {
     /// True if maps are published as ROS 2 topics.
     pub enabled: bool,
-    /// `ROS_DOMAIN_ID`.
+    /// The `ROS_DOMAIN_ID` of the published topics, 0 to 232.
     pub domain: u32,
     /// Prefix of the topics `/<vehicle>/<layer>`; may be empty.
     pub namespace: String,

@@ -15,7 +15,7 @@ pub enum Colours {
     Classes(usize, Vec<Rgb>),
     /// Index of a channel of ids.
     Ids(usize),
-    /// Another channel.
+    /// A channel of numbers, coloured from the least to the greatest value.
     Values {
         /// Index of the channel.
         index: usize,
@@ -24,11 +24,11 @@ pub enum Colours {
         /// Value of the last colour.
         greatest: f64,
     },
-    /// No channel.
+    /// The layer has no channel to colour.
     None,
 }
 
-/// True if the values of a channel are ids, of which only equality means something.
+/// True if the values of a channel are ids: only their equality means something.
 fn is_id(channel: &Channel) -> bool {
     channel.unit == "id"
 }

@@ -52,7 +52,7 @@ pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
 
 /// One vehicle's engine before its thread runs.
 pub struct Engine {
-    /// The vehicle's core.
+    /// The core that makes the maps from the vehicle's events.
     pub pipeline: Pipeline,
     /// Age after the end of capture at which a map is stale, in milliseconds.
     pub valid_ms: u32,
@@ -68,7 +68,7 @@ pub struct Engine {
     pub observer: Option<Observer>,
     /// The newest event with a plan, as it is recorded; `None` before the first.
     pub plan: Option<Bytes>,
-    /// How the header of the next map differs from that of a live one; `None` if it does not.
+    /// How the header of the next map differs from a live map's header; `None` if it does not.
     pub replayed: Option<Replayed>,
 }
 

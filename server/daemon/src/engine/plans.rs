@@ -26,7 +26,7 @@ pub type NewestPlan = Option<Arc<v1::Plan>>;
 /// Why a plan is not taken.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PlanRefused {
-    /// It cannot be drawn.
+    /// The plan cannot be drawn.
     #[error(transparent)]
     Plan(#[from] PlanError),
     /// There are too many plans.
@@ -42,7 +42,7 @@ pub enum PlanRefused {
 pub struct Plans {
     newest: watch::Sender<NewestPlan>,
     rate: Arc<Mutex<TokenBucket>>,
-    /// `None` in a replay, whose events are the recorded ones: a plan is shown at once and not recorded.
+    /// `None` in a replay, whose events are the recorded events: a plan is shown at once and not recorded.
     queue: Option<EventQueue>,
     drops: Arc<DropCounters>,
 }
@@ -83,7 +83,7 @@ impl Plans {
         }
     }
 
-    /// Shows the plan of an event in place of the one before, its stamp moved by `shift_ns`. A recording may hold any
+    /// Shows the plan of an event in place of the plan before, its stamp moved by `shift_ns`. A recording may hold any
     /// bytes: for what is no plan no plan is shown.
     pub(super) fn publish(&self, bytes: Option<&Bytes>, shift_ns: i64) {
         let plan = bytes.and_then(|bytes| v1::Plan::decode(bytes.clone()).ok());
@@ -91,7 +91,7 @@ impl Plans {
         self.newest.send_replace(plan.filter(|plan| plan::check(plan, plan.stamp_ns).is_ok()).map(Arc::new));
     }
 
-    /// The newest plan, and the next ones.
+    /// The newest plan, and then each newer plan.
     pub fn subscribe(&self) -> watch::Receiver<NewestPlan> {
         self.newest.subscribe()
     }

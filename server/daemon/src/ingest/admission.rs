@@ -86,7 +86,7 @@ struct QueuedSample<S> {
 }
 
 impl<S> SourceQueue<S> {
-    /// An empty queue.
+    /// An empty queue that shares the bytes of `bytes` with the other sources.
     pub fn new(bytes: &QueueBytes) -> Self {
         Self {
             shared_bytes: bytes.shared.clone(),
@@ -155,7 +155,7 @@ impl<S> SourceQueue<S> {
     }
 }
 
-/// The hosts with open streams, of which a vehicle or a server has a limited number.
+/// The open streams of a vehicle or of a server by host, limited in number for each host and for all.
 #[derive(Debug)]
 pub struct StreamLimits {
     /// Greatest number of open streams of all hosts.
@@ -184,7 +184,7 @@ pub enum StreamLimitError {
     Host {
         /// Address of the host.
         host: IpAddr,
-        /// Number of its streams.
+        /// Number of open streams of the host.
         streams: usize,
         /// Greatest number of streams of all hosts.
         streams_max: usize,
@@ -192,7 +192,7 @@ pub enum StreamLimitError {
 }
 
 impl StreamLimits {
-    /// At most `streams_max` streams, of which a host never has `kept`; the only stream is for any host.
+    /// At most `streams_max` streams; one host has at most all but `kept` of them, and may always have one.
     pub fn new(streams_max: usize, kept: usize) -> Self {
         Self { streams_max, host_max: streams_max.saturating_sub(kept).max(1), hosts: Mutex::default() }
     }

@@ -20,7 +20,7 @@ const UNKNOWN_SENDERS_MAX: usize = 8;
 #[derive(Debug, Default)]
 pub struct DropCounters {
     pub(super) unreported: Mutex<Unreported>,
-    /// The newest last.
+    /// Unknown senders, the newest last.
     unknown_senders: Mutex<VecDeque<UnknownSender>>,
     /// Refused messages by reason; the ledger counts all of them as `observation`, and no part of a message.
     refused_messages: Mutex<BTreeMap<&'static str, u64>>,
@@ -36,7 +36,7 @@ pub(super) type Unreported = BTreeMap<(Cause, u16), u64>;
 /// A sender of datagrams that is none of the vehicle's sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UnknownSender {
-    /// Source address of its datagrams.
+    /// Source address of the sender's datagrams.
     pub address: SocketAddr,
     /// Number of its datagrams since it is remembered.
     pub datagrams: u64,

@@ -27,7 +27,7 @@ const AHEAD_NS_MAX: i64 = 10_000_000_000;
 /// The gateway of one vehicle.
 #[derive(Debug)]
 pub struct Gateway {
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub vehicle: Arc<str>,
     /// Limits of one observation.
     pub limits: Limits,
@@ -210,8 +210,8 @@ impl Gateway {
         });
     }
 
-    /// Pushes the declaration of a new sensor, or of one that exists already. The configuration here changes as the
-    /// engine's will, so that the next observation can name the sensor.
+    /// Pushes the declaration of a new or an existing sensor. The configuration here changes as the engine's will, so
+    /// that the next observation can name the sensor.
     fn push_declaration(
         &self,
         captured_ns: Option<i64>,

@@ -8,7 +8,7 @@
 //! | `zenoh_source` | the queue of one source -> gateway; reports back |
 //! | [`gateway`] | one observation of a client -> events on the queue of its vehicle |
 //! | [`observation`] | `clearway.v1.Observation` -> event bodies, or the reason of the refusal |
-//! | [`admission`] | streams and observations -> those that are admitted now, by turns of their sources |
+//! | [`admission`] | streams and observations -> the observations that are admitted now, by turns of their sources |
 //! | [`receipt`] | outcome of an event -> report to its client |
 //! | [`ros`] | ROS 2 messages -> readings |
 //! | [`queue`] | readings -> numbered events on one bounded queue a vehicle |

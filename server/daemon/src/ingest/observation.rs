@@ -2,7 +2,7 @@
 //!
 //! An observation is bytes of a client. All lengths are compared before any allocation, and an allocation is no longer
 //! than the message. The core checks the rest (stamps, poses, roads, lists of different lengths), so that the journal
-//! contains those refusals.
+//! contains its refusals.
 
 use bytes::Bytes;
 use clearway_mapping::event::Body;
@@ -46,24 +46,24 @@ pub enum ObservationError {
     /// The bytes do not decode as an observation.
     #[error("not a clearway.v1.Observation: {reason}")]
     Message {
-        /// The decoder's reason.
+        /// Error of the protobuf decoder.
         reason: String,
     },
     /// The message is longer than any allowed scan.
     #[error("message of {bytes} bytes: up to {bytes_max} are allowed")]
     Length {
-        /// The message's length.
+        /// Length of the message, in bytes.
         bytes: usize,
-        /// [`Limits::message_bytes_max`].
+        /// Greatest length in bytes, [`Limits::message_bytes_max`].
         bytes_max: usize,
     },
-    /// The observation has no body, or one that this version does not have.
+    /// The observation has no body, or a body that this version does not know.
     #[error("observation without a body: scan, ego_pose, road, packets, end or declaration is allowed")]
     Body,
     /// A packed list ends within a number.
     #[error("{list} of {bytes} bytes: a multiple of {number_bytes} bytes is allowed")]
     Part {
-        /// The list's field.
+        /// Field of the list, as in `clearway.v1.Observation`.
         list: &'static str,
         /// The list's length in bytes.
         bytes: usize,
@@ -77,7 +77,7 @@ pub enum ObservationError {
         what: &'static str,
         /// Number of elements.
         count: usize,
-        /// [`Limits::points_max`].
+        /// Greatest number, [`Limits::points_max`].
         points_max: usize,
     },
     /// The columns do not match the points of the scan.
@@ -123,7 +123,7 @@ pub enum ObservationError {
         stamp_ns: i64,
         /// Time by which it is ahead, ns.
         ahead_ns: i64,
-        /// [`Limits::ahead_ns_max`].
+        /// Greatest time ahead in ns, [`Limits::ahead_ns_max`].
         ahead_ns_max: i64,
     },
     /// A required field is missing.
@@ -131,7 +131,7 @@ pub enum ObservationError {
     Missing {
         /// `ego_pose`, `road`, `scan` or `declaration`.
         body: &'static str,
-        /// The missing field.
+        /// Name of the missing field.
         what: &'static str,
     },
 }
@@ -195,7 +195,7 @@ pub fn decode(observation: v1::Observation, limits: &Limits) -> Result<Bodies, O
 }
 
 /// Returns `bodies` if no stamp in them is too far ahead of the server's clock `now_ns`. A stamp of the past is
-/// allowed: it may be that of an old drive, and a map never looks younger by it.
+/// allowed: it may come from an old drive, and a map never looks younger by it.
 ///
 /// # Errors
 /// [`ObservationError::StampAhead`] with the first stamp that is.

@@ -26,7 +26,7 @@ use crate::base::sync::locked;
 const REPORT_PERIOD_NS: u64 = 100_000_000;
 
 /// Greatest age of a datagram by the kernel's stamp, in ns. Ours: no server stands still for longer and goes on; a
-/// stamp that differs by more is that of a clock that was set between the kernel's stamp and the reading.
+/// stamp that differs by more comes from a clock that was set between the kernel's stamp and the reading.
 const RECEIVED_AGE_NS_MAX: i64 = 60_000_000_000;
 
 /// An event without its number: what a source of readings yields.
@@ -36,7 +36,7 @@ pub struct Reading {
     pub arrival_ns: i64,
     /// Index of the sensor in the vehicle's configuration.
     pub source: u16,
-    /// The content.
+    /// Content of the reading.
     pub body: Body,
 }
 
@@ -55,11 +55,11 @@ pub enum Arrival {
 /// A reading that cannot be made to wait.
 #[derive(Debug)]
 pub struct LiveReading {
-    /// When it arrived.
+    /// When the reading arrived.
     pub arrival: Arrival,
     /// Index of the sensor in the vehicle's configuration.
     pub source: u16,
-    /// The content.
+    /// Content of the event.
     pub body: Body,
     /// Delivers the outcome to the client that sent it.
     pub receipt: Option<Receipt>,
@@ -80,7 +80,7 @@ pub struct QueueClosedError;
 /// One event on the queue.
 #[derive(Debug)]
 pub struct QueuedEvent {
-    /// The event.
+    /// The event, as the pipeline gets it.
     pub event: Event,
     /// Delivers the outcome to the client that sent the event. A recording does not contain it.
     pub receipt: Option<Receipt>,
@@ -191,7 +191,7 @@ impl EventQueue {
         self.clock.now_ns()
     }
 
-    /// Pushes an event that is no reading, if the queue has space. Its stamp is that of the newest event, so that the
+    /// Pushes an event that is no reading, if the queue has space. Its stamp is the newest event's stamp, so that the
     /// time of a captured drive does not jump. Never waits, and counts nothing: the caller tries again. True if the
     /// event is on the queue.
     pub fn push_if_space(&self, source: u16, body: Body) -> bool {
@@ -316,7 +316,7 @@ impl EventQueue {
         QueuePosition { next_sequence: state.next_sequence, reported_ns: state.reported_ns }
     }
 
-    /// Goes on as if the events so far were those before `position`: a replay jumps.
+    /// Goes on as if the events so far were the events before `position`: a replay jumps.
     pub fn set_position(&self, position: QueuePosition) {
         let mut state = locked(&self.state);
         (state.next_sequence, state.reported_ns) = (position.next_sequence, position.reported_ns);

@@ -15,9 +15,9 @@ use super::sensor_senders::SensorSender;
 pub enum Outcome {
     /// The core accepted it, and the map that it completed, if any, is published.
     Accepted,
-    /// It was refused.
+    /// The event was refused, by the gateway or by the core.
     Refused {
-        /// The ledger's key.
+        /// Key in the ledger under which the refusal is counted.
         reason: &'static str,
         /// The wrong value, and what is allowed.
         message: String,
@@ -33,7 +33,7 @@ impl From<Result<(), EventError>> for Outcome {
     }
 }
 
-/// Identifies an observation.
+/// Identifies an observation among all observations of its stream or session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ObservationId {
     /// The client's id; 0 on a stream of a single client.
@@ -60,7 +60,7 @@ impl Receipt {
         Self { id, outcomes: Some(outcomes.clone()), _permit: permit }
     }
 
-    /// Delivers the outcome.
+    /// Sends the outcome to the client that sent the observation.
     pub fn deliver(mut self, outcome: Outcome) {
         self.send(outcome);
     }
@@ -84,9 +84,9 @@ impl Drop for Receipt {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("number {number}: more than {newest} is allowed")]
 pub struct NumberError {
-    /// The observation's number.
+    /// Number of the refused observation.
     pub number: u64,
-    /// The greatest number before it.
+    /// The greatest number among the observations before.
     pub newest: u64,
 }
 

@@ -1,5 +1,5 @@
-//! Who sends the data of each sensor of a vehicle, to tell when several do at once: the data of each would replace
-//! those of the others.
+//! Who sends the data of each sensor of a vehicle, to tell when several senders do so at once: the data of one sender
+//! would replace the data of the others.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -19,7 +19,7 @@ const SENDERS_MAX: usize = 4;
 /// A sender of a sensor's data.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SensorSender {
-    /// Source address of its datagrams.
+    /// Source address of the sender's datagrams.
     Address(SocketAddr),
     /// What names it alone.
     Named(Arc<str>),

@@ -9,7 +9,7 @@
 //!
 //! With roles ([`Senders`]) a sample needs a certificate with the role of an ingester, as over gRPC. zenoh's access
 //! control refuses the others first; this check also holds if it is configured otherwise. Without roles a sender may
-//! name any session, also that of another sender.
+//! name any session, also another sender's session.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -110,7 +110,7 @@ struct Queues {
 struct Queue {
     source: Option<ZenohId>,
     samples: Arc<SourceQueue<Sample>>,
-    /// When its newest sample came.
+    /// Time at which the queue's newest sample came.
     heard: Instant,
     /// True if an observation of it was accepted.
     is_accepted: Arc<AtomicBool>,

@@ -36,7 +36,7 @@ pub(super) const SILENT_MAX: Duration = Duration::from_secs(600);
 
 /// A sample that is not decoded yet.
 pub(super) struct Sample {
-    /// Empty if it is too long.
+    /// Bytes of the sample; empty if they are too long.
     pub payload: ZBytes,
     /// Length of the payload as it came.
     pub length: usize,
@@ -178,7 +178,7 @@ fn sensor_of_key<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Opti
 /// The remembered clients of one source, ordered from the longest silent to the most recent.
 #[derive(Default)]
 struct Clients {
-    /// The source.
+    /// Id of the zenoh session; `None` if the samples state none.
     of: Option<ZenohId>,
     all: Vec<Client>,
     /// The sessions of clients that have ended since they were last taken.
@@ -186,7 +186,7 @@ struct Clients {
 }
 
 struct Client {
-    /// When its newest observation came.
+    /// Time at which the client's newest observation came.
     heard: Instant,
     id: u64,
     session: ClientSession,

@@ -52,8 +52,8 @@ pub(crate) async fn announce(
     Ok(())
 }
 
-/// Hears the announcements of other servers until the subscriber is dropped. Refused ones are logged, at most one a
-/// second.
+/// Hears the announcements of other servers until the subscriber is dropped. Refused announcements are logged, at most
+/// one a second.
 ///
 /// # Errors
 /// [`ZenohError`] if the subscriber cannot be declared.

@@ -5,7 +5,7 @@
 //! the end of a replay), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest map was made from) and `/tf`
 //! (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels of maps without a subscription are not made;
 //! a message is encoded once for all clients. A new subscription gets the newest map at once. A slow client skips
-//! messages, and one that receives nothing for [`SEND_TIMEOUT`] is disconnected.
+//! messages, and a client that receives nothing for [`SEND_TIMEOUT`] is disconnected.
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
@@ -40,9 +40,9 @@ use crate::engine::subscriptions::LayerSubscription;
 use crate::status::{Reader, Transport};
 use clearway_journal::encode::EncodedMap;
 
-/// Pages from which Foxglove connects, beside those of the configuration.
+/// Pages from which Foxglove connects, beside the configured pages.
 pub const ORIGINS: &[&str] = &["https://app.foxglove.dev"];
-/// The protocol.
+/// Name of the WebSocket subprotocol.
 const PROTOCOL: &str = "foxglove.sdk.v1";
 /// Longest time to send a message. Ours: a client this late shows stale maps anyway.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
@@ -80,7 +80,7 @@ struct All {
     published: Arc<watch::Sender<u64>>,
 }
 
-/// What a channel carries.
+/// The kind of a channel's messages.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Kind {
     Layer(&'static str),
@@ -99,7 +99,7 @@ struct Message {
     data: Bytes,
 }
 
-/// One channel.
+/// One channel of the server, for all clients.
 struct Channel {
     id: u64,
     topic: String,
@@ -306,12 +306,12 @@ struct FoxgloveClient {
 /// One client's subscription to one channel.
 struct Subscription {
     newest: watch::Receiver<Option<Message>>,
-    /// Keeps its layer active.
+    /// Keeps the channel's layer active.
     layer: Option<LayerSubscription>,
     reader: Reader,
 }
 
-/// What a client may ask for.
+/// A client's request, as JSON.
 #[derive(Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase")]
 enum FoxgloveRequest {
@@ -415,8 +415,8 @@ impl FoxgloveClient {
     }
 }
 
-/// The first subscription after `last` (all, if there is none) that has a new message, and its frame. Frames are made
-/// one at a time: those of a client that does not read, and has many subscriptions, would be many times the message.
+/// The first subscription after `last` (all, if there is none) that has a new message, and its frame. One frame is made
+/// at a time: frames of many subscriptions that a client does not read would be many times the message.
 fn next_due(subscriptions: &mut BTreeMap<u32, Subscription>, last: Option<u32>) -> Option<(u32, WsMessage)> {
     let after = (last.map_or(Bound::Unbounded, Bound::Excluded), Bound::Unbounded);
     let mut changed = subscriptions.range_mut(after).filter(|(_, of)| of.newest.has_changed().unwrap_or(false));

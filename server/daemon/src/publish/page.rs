@@ -64,11 +64,11 @@ fn rows<'a>(document: &'a str, header: &'a str) -> impl Iterator<Item = Vec<&'a 
 /// What is served: the vehicles, the counts of the listeners by name, and the replay if there is one.
 #[derive(Clone)]
 pub struct Shown {
-    /// The vehicles.
+    /// The vehicles of this server.
     pub vehicles: Vehicles,
     /// The vehicles of other servers.
     pub fleet: Fleet,
-    /// The listeners.
+    /// The TCP listeners, each with its name.
     pub listeners: Arc<[(&'static str, ListenerHandle)]>,
     /// Controls the replay that the server serves.
     pub replay: Option<ReplayHandle>,

@@ -9,13 +9,13 @@
 //! | | `{"type":"replay",...}`: a request of the time bar, of operators |
 //! | | `{"type":"points","vehicle","wanted"}`: one frame of points, or no more of them ([`super::page_points`]) |
 //! | to the browser, binary | `clearway.v1.MapUpdate`; the header names the vehicle. A frame of points |
-//! | to the browser, text | `"watching"` (the maps after it are those of this `id`), `"refused"` (with `reason`), `"fleet"` (the status of each vehicle, once a second), `"replay"` (at each change), `"points"` (with `reason`: why there are none) |
+//! | to the browser, text | `"watching"` (the maps after it belong to the selection with this `id`), `"refused"` (with `reason`), `"fleet"` (the status of each vehicle, once a second), `"replay"` (at each change), `"points"` (with `reason`: why there are none) |
 //!
 //! A selection means what it means over gRPC. With `max_in_flight`, no more maps than that are on the way, so a slow
 //! link has no backlog.
 //!
 //! The server sends a ping once a second, and the status with the answer, which a browser gives by itself. While an
-//! answer is late nothing else is sent: a peer that does not read costs a ping. One that has not answered for
+//! answer is late nothing else is sent: a peer that does not read costs a ping. A peer that has not answered for
 //! [`PONG_TIMEOUT`], or takes no byte for [`SEND_TIMEOUT`], is disconnected.
 
 use std::collections::BTreeMap;

@@ -70,7 +70,7 @@ impl PagePoints {
         *self.vehicle == *vehicle
     }
 
-    /// Takes a request.
+    /// Asks for one frame of points, which [`next_points`] then returns.
     pub fn request(&mut self) {
         self.is_due = true;
     }

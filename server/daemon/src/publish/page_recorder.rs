@@ -1,6 +1,6 @@
 //! The recorder's buttons on the page: requests of operators, and what came of them, as JSON.
 //!
-//! A request is `{"type":"recorder","command":"save","seconds":30}`; the commands are those of
+//! A request is `{"type":"recorder","command":"save","seconds":30}`; the commands are the calls of
 //! [`clearway_proto::v1::recording_service_server::RecordingService`]: `start`, `stop`, `split`, `save`. The answer has
 //! the state after it, the files that were saved, and `error`. Operators get one without asking when they connect, so a
 //! page that has none shows no buttons.

@@ -9,9 +9,9 @@
 //! `@ros2_lv` announce the node and its publishers; the bridge has it under `<topic>`. The payload is CDR, with an
 //! attachment: sequence, time of sending, length 16, the publisher's 16 bytes.
 //!
-//! A message is made only while there is a subscriber; the first subscriber gets the newest map at once, later ones get
-//! it from the publisher's cache. When the newest map becomes stale, or the last subscriber leaves, its grids are sent
-//! once more, unknown, so that no cache keeps a grid that looks fresh.
+//! A message is made only while there is a subscriber; the first subscriber gets the newest map at once, later
+//! subscribers get it from the publisher's cache. When the newest map becomes stale, or the last subscriber leaves, its
+//! grids are sent once more, unknown, so that no cache keeps a grid that looks fresh.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
@@ -62,7 +62,7 @@ pub(super) struct Node<'a> {
 }
 
 impl<'a> Node<'a> {
-    /// Declares the node.
+    /// Declares the liveliness token of the node, by which ROS 2 finds it.
     pub async fn declare(session: &'a Session, options: &'a Ros2) -> Result<Self, ZenohError> {
         let mut node = Self { session, options, tokens: Vec::new() };
         node.declare_token(&format!("0/NN/%/%/{NODE}")).await?;

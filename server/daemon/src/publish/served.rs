@@ -66,7 +66,7 @@ impl Served {
     /// Checks that the vehicle's maps have all these layers.
     ///
     /// # Errors
-    /// [`UnknownNameError::Layer`] for the first layer that they do not have, with the known ones.
+    /// [`UnknownNameError::Layer`] for the first layer that the maps do not have, with the known layers.
     pub fn check_layers(&self, layers: &[String]) -> Result<(), UnknownNameError> {
         let known = &self.status.layers;
         match layers.iter().find(|layer| !known.contains(&layer.as_str())) {

@@ -12,12 +12,11 @@
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
 //!
 //! A server that is the client of a router has one map of a vehicle on the way at a time ([`Pace`]), so that a thin
-//! link
-//! has fewer maps and not older ones; the maps between count as skipped.
+//! link has fewer maps and not older maps; the maps between count as skipped.
 //!
-//! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a
-//! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
-//! reports have zenoh's default priority.
+//! Congestion drops: blocking would let one stopped peer delay the healthy peers. Maps have the highest priority on a
+//! link, because planners brake by them; the status has the lowest, because the next status replaces it; observations
+//! and reports have zenoh's default priority.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -116,7 +115,7 @@ impl Publisher {
     async fn publish(&mut self, served: &Served) -> Result<(), ZenohError> {
         let vehicle = &served.status.name;
         let mut publishers = Vec::new();
-        // By default replies block, and one late joiner that stops at once would delay the next ones.
+        // By default replies block, and one late joiner that stops at once would delay the next late joiners.
         let replies = RepliesConfig::default().congestion_control(CongestionControl::Drop).priority(MAPS);
         let cache = CacheConfig::default().max_samples(1).replies_config(replies);
         for layer in &served.status.layers {

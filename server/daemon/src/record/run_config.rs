@@ -27,7 +27,7 @@ pub fn run_config(recording: &RecordingReader) -> Result<(Config, Calibrations),
 }
 
 /// The configuration of the recorded run with some of its keys set to other values. A key that is a constant of this
-/// version is left out, and a warning names it if its recorded value is another one.
+/// version is left out, and a warning names it if its recorded value is another value.
 ///
 /// # Errors
 /// [`RecordingError::NoConfig`] if the recording has no configuration, [`RecordingError::Config`] if it is invalid.
@@ -185,7 +185,7 @@ fn is_same_value(recorded: &toml::Value, constant: &str) -> bool {
 }
 
 /// Sets the rules of a run that was recorded before they could be configured. A recorded configuration is complete, so
-/// a table that it lacks is one that its program did not have.
+/// its program did not have a table that it lacks.
 fn use_rules_of_the_run(config: &mut Config, text: &str) {
     let document: toml::Table = text.parse().unwrap_or_default();
     let recorded = document.get("vehicle").and_then(toml::Value::as_array).into_iter().flatten();

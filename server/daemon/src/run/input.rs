@@ -7,7 +7,7 @@ use crate::ingest::queue::EventQueue;
 
 /// Where the events of one vehicle enter a running server.
 pub struct VehicleInput {
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub name: Arc<str>,
     /// The vehicle's event queue.
     pub queue: EventQueue,

@@ -11,7 +11,7 @@ use crate::publish::foxglove;
 use crate::publish::listen::security::Security;
 use crate::publish::listen::{AllSlots, Listener, ListenerHandle, Protocol};
 
-/// The TCP listeners.
+/// The TCP listeners that the configuration enables.
 pub(super) struct Listeners {
     pub grpc: Option<Listener>,
     pub page: Option<Listener>,

@@ -223,7 +223,7 @@ impl Running {
     }
 }
 
-/// Waits for the engines, and then for the recorder, whose error matters more than that of an engine.
+/// Waits for the engines, and then for the recorder, whose error matters more than an engine's error.
 fn finish(
     engines: Vec<(Arc<str>, JoinHandle<()>)>,
     recorder: Option<Recorder>,

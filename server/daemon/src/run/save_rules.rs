@@ -48,8 +48,8 @@ fn observe(config: &Config, vehicles: &Vehicles) -> Vec<Observed> {
 /// A vehicle and the name of its sensor that is lost, or none if its map is stale.
 type Condition = (usize, Option<String>);
 
-/// Which conditions hold, and which have not held at some time. A condition that begins to hold begins a save; one that
-/// has held since the start does not.
+/// Which conditions hold, and which have not held at some time. A condition that begins to hold begins a save; a
+/// condition that has held since the start does not.
 #[derive(Debug, Default)]
 struct Conditions {
     /// Conditions that hold.

@@ -14,7 +14,7 @@ use crate::replay_control::ReplayHandle;
 /// The parameters of a server.
 #[derive(Default)]
 pub struct Setup {
-    /// The checked configuration.
+    /// The configuration, checked.
     pub config: Config,
     /// The calibration tables of all sensors, as [`Config::calibrations`] returns them.
     pub calibrations: Calibrations,
@@ -65,7 +65,7 @@ pub enum StartError {
     /// A vehicle's sockets cannot be bound.
     #[error("vehicle {vehicle}: {source}")]
     Udp {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: Arc<str>,
         /// The address and the system's reason.
         source: udp::BindError,
@@ -76,9 +76,9 @@ pub enum StartError {
     /// The thread of an engine cannot be started.
     #[error("vehicle {vehicle}: no thread for its engine: {source}")]
     Thread {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: Arc<str>,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The zenoh session cannot be opened, or a key cannot be declared on it.

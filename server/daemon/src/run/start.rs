@@ -53,7 +53,7 @@ const LISTENER_SILENT_MAX: Duration = Duration::from_secs(3);
 /// Interval at which the listeners are looked at.
 const LISTENER_POLL_INTERVAL: Duration = Duration::from_millis(500);
 
-/// The server.
+/// A server with its vehicles, listeners and recorder; [`Server::start`] starts it.
 pub struct Server;
 
 impl Server {

@@ -31,7 +31,7 @@ type Seen = (PathBuf, u64, SystemTime);
 enum Problem {
     /// A part or the configuration: the reason.
     Part(String),
-    /// The store: the reason.
+    /// The store refuses or does not answer: the reason.
     Store(String),
 }
 
@@ -45,7 +45,7 @@ struct Uploads {
     store: Option<Arc<dyn ObjectStore>>,
     limit: Option<UploadLimit>,
     answer_timeout: Duration,
-    /// Parts that the store has confirmed, and those without an event or a map.
+    /// Parts that the store has confirmed, and parts without an event or a map.
     settled: BTreeSet<Seen>,
 }
 
@@ -147,7 +147,7 @@ impl Uploads {
         }
     }
 
-    /// The finished parts of the folder, also those that an earlier run has left unfinished.
+    /// The finished parts of the folder, also parts that an earlier run has left unfinished.
     fn finished(&self) -> Vec<(PathBuf, Seen)> {
         let parts = self.control.list().into_iter().filter(|part| !part.is_unfinished || part.is_left);
         let paths = parts.map(|part| PathBuf::from(part.file));

@@ -23,10 +23,10 @@ const ASSESS_PERIOD: Duration = Duration::from_millis(200);
 /// Time after which another server that claims the vehicle's name is forgotten. Ours: it publishes once a second.
 const CLAIM_AGE_MAX: Duration = Duration::from_secs(4);
 
-/// What an assessment has found.
+/// The result of an assessment of one vehicle.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Assessment {
-    /// The state.
+    /// State of the vehicle's maps.
     pub state: State,
     /// Time for which the state has lasted.
     pub state_for: Duration,
@@ -70,7 +70,7 @@ pub async fn state_changed(states: &mut [watch::Receiver<State>]) {
 }
 
 impl VehicleStatus {
-    /// The state of the vehicle as it changes, with the one of now.
+    /// The state of the vehicle as it changes, the present state first.
     pub fn states(&self) -> watch::Receiver<State> {
         self.health_state.subscribe()
     }

@@ -72,7 +72,7 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
 }
 
 /// The state and the counts of the recorder as a JSON object: the fields of [`v1::RecorderStatus`] under their own
-/// names, those of the store in an object of their own.
+/// names, the store's fields in an object of their own.
 pub fn recorder_json(recorder: &v1::RecorderStatus) -> Value {
     json!({
         "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,

@@ -13,12 +13,12 @@ const AWAY_NAMED_AFTER: Duration = Duration::from_secs(2);
 /// Time before the end of a certificate at which that is named. Ours: a week to write a new one.
 const END_NAMED_BEFORE: Duration = Duration::from_secs(7 * 24 * 3600);
 
-/// The zenoh routers of which none is connected.
+/// The configured zenoh routers, while none of them is connected.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Away {
-    /// Since when.
+    /// Time since which no router is connected.
     pub since: Instant,
-    /// Their endpoints.
+    /// Endpoints of the routers, as configured.
     pub endpoints: String,
     /// Why the newest attempt failed; empty if that is not known.
     pub reason: String,

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-/// The unit of times in `/proc/self/stat`, a second of which has this many on every Linux.
+/// Ticks in a second, on every Linux; a tick is the unit of times in `/proc/self/stat`.
 const TICKS_HZ: f64 = 100.0;
 
 /// The figures of a process; `None` where the system does not tell one.

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 pub enum Transport {
     /// A stream of `MapService.Watch`.
     Grpc,
-    /// An open page.
+    /// A browser that has the page open.
     Page,
     /// A key of zenoh with a subscriber.
     Zenoh,
@@ -75,7 +75,7 @@ impl Reader {
         Self { readers: readers.clone(), transport, last: None }
     }
 
-    /// Counts the maps between the last map that this reader got and this one, by boot id and sequence, as skipped;
+    /// Counts the maps between the last map that this reader got and this map, by boot id and sequence, as skipped;
     /// returns their number. None are between maps of different runs.
     pub fn got(&mut self, boot_id: u64, sequence: u64) -> u64 {
         let last = self.last.replace((boot_id, sequence)).filter(|(boot, _)| *boot == boot_id);

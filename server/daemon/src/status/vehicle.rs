@@ -50,7 +50,7 @@ pub struct VehicleStatus {
     pub layers: Vec<&'static str>,
     /// The readers of its maps, by transport.
     pub transports: Arc<Readers>,
-    /// Traces its maps.
+    /// Collects the traces of the vehicle's maps.
     pub traces: Traces,
     /// Outline of the vehicle in the ego frame as x0, y0, x1, y1, ..., in metres; empty if none is configured.
     pub(super) outline_m: Vec<f64>,
@@ -104,21 +104,21 @@ pub(super) struct Changing {
 pub(super) struct Seen {
     received: u64,
     read: u64,
-    /// Something arrived.
+    /// Time of the newest packet or scan that arrived.
     pub received_at: Option<Duration>,
-    /// A packet or scan could be read.
+    /// Time of the newest packet or scan that could be read.
     pub read_at: Option<Duration>,
 }
 
 /// A map that the engine has just made, and what of it the status shows.
 pub(crate) struct MadeMap<'a> {
-    /// The map.
+    /// The map, encoded.
     pub encoded: &'a EncodedMap,
-    /// Its sensors.
+    /// State of each sensor when the map was made.
     pub states: Vec<v1::SensorState>,
     /// Time that it took in each stage.
     pub stages: StageTimes,
-    /// Age at which it is stale.
+    /// Age at which the map is stale.
     pub validity: Duration,
     /// Speed of the vehicle.
     pub speed_m_s: Option<f64>,
@@ -222,7 +222,7 @@ impl VehicleStatus {
         Self { outline_m: [front, right, front, left, rear, left, rear, right].map(exact).into(), ..self }
     }
 
-    /// Traces the maps.
+    /// Sends traces of the vehicle's maps to `traces`.
     pub fn with_traces(self, traces: Traces) -> Self {
         Self { traces, ..self }
     }
@@ -379,7 +379,7 @@ impl VehicleStatus {
         state.latencies_ns.push_back(u64::try_from(latency.as_nanos()).unwrap_or(u64::MAX));
     }
 
-    /// The current status.
+    /// A copy of the current status, with the rates and latencies of the newest maps.
     pub fn snapshot(&self) -> Snapshot {
         let state = locked(&self.changing);
         let mut latencies: Vec<u64> = state.latencies_ns.iter().copied().collect();
@@ -412,8 +412,8 @@ impl VehicleStatus {
     }
 }
 
-/// The counts of packets of which the loss is computed, with the ledgers of the sensors: packets of unknown senders and
-/// copies of packets are not expected.
+/// The counts of packets from which the loss is computed, with the ledgers of the sensors: packets of unknown senders
+/// and copies of packets are not expected.
 pub(super) fn packet_counts(sensors: &[NamedStatus]) -> PacketCounts {
     let sum = |count: fn(&NamedStatus) -> u64| sensors.iter().map(count).sum();
     PacketCounts {

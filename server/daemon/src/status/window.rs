@@ -45,7 +45,7 @@ impl Window {
         }
     }
 
-    /// Adds the counts at `at`; those that follow another sample too soon are left out.
+    /// Adds the counts at `at`; counts that follow another sample too soon are left out.
     pub fn push_counts(&mut self, at: Duration, counts: PacketCounts) {
         if self.counts.back().is_some_and(|(last, _)| at.saturating_sub(*last) < SAMPLE_PERIOD) {
             return;
@@ -69,7 +69,7 @@ impl Window {
         if maps == 0 { 0.0 } else { sum as f64 / f64::from(maps) }
     }
 
-    /// Median time of each stage in milliseconds; stages of which no time is known are absent.
+    /// Median time of each stage in milliseconds; stages without a known time are absent.
     pub fn latency_ms(&self, now: Duration) -> BTreeMap<&'static str, f64> {
         let median = |(index, stage)| {
             let mut times: Vec<Duration> =

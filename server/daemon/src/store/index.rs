@@ -21,11 +21,11 @@ pub const CELL_M: f64 = 25.0;
 pub struct Entry {
     /// The name of the part's object in the store.
     pub part: String,
-    /// The vehicle's name.
+    /// Name of the vehicle whose messages the part has.
     pub vehicle: String,
     /// Log times of the first and the last message, ns since the Unix epoch.
     pub from_ns: u64,
-    /// As `from_ns`.
+    /// Log time of the last message, ns since the Unix epoch.
     pub to_ns: u64,
     /// Length of the part, in bytes.
     pub bytes: u64,
@@ -46,7 +46,7 @@ pub struct Entry {
 /// What is searched for; an absent part of it allows all.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Search {
-    /// The vehicle's name.
+    /// Name of the vehicle; all vehicles if `None`.
     pub vehicle: Option<String>,
     /// Parts that end before this are left out; ns since the Unix epoch.
     pub from_ns: Option<u64>,

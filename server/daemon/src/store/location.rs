@@ -21,13 +21,13 @@ const RETRY_TIMEOUT: Duration = Duration::from_secs(5);
 pub struct OpenError {
     /// The path or URL of the store.
     pub url: String,
-    /// The reason.
+    /// Why the store cannot be opened.
     pub reason: String,
 }
 
 /// Opens a store to write: a folder by its path or as `file:///PATH`, which is created if it does not exist, or
 /// `s3://BUCKET/PREFIX`. The environment variables `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and
-/// `AWS_ENDPOINT_URL` (of a compatible server, also by `http`) are those of the AWS tools.
+/// `AWS_ENDPOINT_URL` (of a compatible server, also by `http`) have the meaning that the AWS tools give them.
 ///
 /// # Errors
 /// [`OpenError`] for another kind of URL, a folder that cannot be created, or variables that contradict each other. A

@@ -8,8 +8,8 @@
 //! | [`upload`] | finished parts of a folder -> the store, confirmed |
 //! | [`upload_limit`] | requests to a bucket -> the same within a limit of the configuration |
 //!
-//! A part is the object `parts/<time>-<CRC>.mcap`; what it holds is the object `index/<vehicle>/<time>-<CRC>.json`,
-//! one for each vehicle. The time is that of the first message, in ns, in 20 digits, so that names sort by time.
+//! A part is the object `parts/<time>-<CRC>.mcap`; what it holds is the object `index/<vehicle>/<time>-<CRC>.json`, one
+//! for each vehicle. The time is the first message's log time, in ns, in 20 digits, so that names sort by time.
 
 pub mod fetch;
 pub mod index;

@@ -1,6 +1,6 @@
 //! Finished parts of a folder -> the store, confirmed.
 //!
-//! A part is confirmed when it was read back from the store, its CRC was that of the file, and its index was written
+//! A part is confirmed when it was read back from the store, its CRC equalled the file's CRC, and its index was written
 //! after it. A file beside the part, `<part>.confirmed`, then says so; it is what makes the part deletable. A crash
 //! between two steps repeats them: the name of a part has its CRC, so it is never written with other contents.
 
@@ -41,9 +41,9 @@ pub enum UploadError {
     /// The part cannot be read.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// The part is not a recording.
@@ -52,15 +52,15 @@ pub enum UploadError {
     /// The part has no event and no map.
     #[error("{}: a recording without an event or a map", file.display())]
     Nothing {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
     },
     /// The store refused the part or did not answer.
     #[error("{}: {}", file.display(), reason(source))]
     Store {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
-        /// The store's reason.
+        /// Error of the store.
         source: object_store::Error,
     },
     /// The store has other bytes than it was sent.
@@ -69,7 +69,7 @@ pub enum UploadError {
         file.display()
     )]
     Differs {
-        /// The part.
+        /// Path of the part.
         file: PathBuf,
         /// The name of the object.
         part: String,

@@ -20,17 +20,17 @@ pub enum CaptureError {
     /// The file cannot be opened.
     #[error("{}: {source}", file.display())]
     Open {
-        /// The capture.
+        /// Path of the capture.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The file is not a capture, or is damaged.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The capture.
+        /// Path of the capture.
         file: PathBuf,
-        /// The fault.
+        /// Why the capture cannot be read on.
         source: Error,
     },
 }

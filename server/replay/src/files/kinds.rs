@@ -28,7 +28,7 @@ pub enum FilesError {
     Open {
         /// The file or folder.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The kind of a file is unknown.
@@ -40,11 +40,11 @@ pub enum FilesError {
     /// A file can be read after it is converted.
     #[error("{}: {what}: {advice}", file.display())]
     Converted {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// What it is.
+        /// The kind of the file, in words.
         what: &'static str,
-        /// The command that converts it.
+        /// The command that converts the file.
         advice: String,
     },
     /// A folder has no file of a known kind.
@@ -62,7 +62,7 @@ pub enum FilesError {
         file.display()
     )]
     Overlap {
-        /// The later file.
+        /// Path of the later file.
         file: PathBuf,
         /// By how much, in seconds.
         overlap_s: f64,
@@ -81,7 +81,7 @@ pub enum FilesError {
 /// A file that is truncated or damaged; the readings of its whole parts were used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Truncated {
-    /// The file.
+    /// Path of the file.
     pub file: PathBuf,
     /// How the file is incomplete.
     pub reason: String,
@@ -201,7 +201,7 @@ fn order_of(file: &Path) -> (String, usize, String) {
     let (stem, ending) = name.split_once('.').unwrap_or((&name, ""));
     let text = stem.trim_end_matches(|c: char| c.is_ascii_digit());
     let number = stem[text.len()..].trim_start_matches('0');
-    // Of two numbers without leading zeros, the one with fewer digits is less.
+    // Of two numbers without leading zeros, the number with fewer digits is less.
     (text.to_owned(), number.len(), format!("{number}.{ending}"))
 }
 

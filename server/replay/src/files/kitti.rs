@@ -21,17 +21,17 @@ pub enum ScanError {
     /// The file cannot be read.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The file has no valid scan.
     #[error("{}: {source}", file.display())]
     Scan {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// The fault.
+        /// Why the file has no valid scan.
         source: Box<ScanFileError>,
     },
 }
@@ -44,7 +44,7 @@ pub fn read(file: &Path, index: u64) -> Result<Reading, ScanError> {
     read_with_format(file, index).map(|(_, reading)| reading)
 }
 
-/// Reads one scan, with the format of its file; its stamp is that of [`read`].
+/// Reads one scan as [`read`] does, with the format of its file.
 ///
 /// # Errors
 /// [`ScanError::Read`] if the file cannot be read, [`ScanError::Scan`] if it has no valid scan.

@@ -74,7 +74,7 @@ pub enum McapError {
     /// The file cannot be read or is damaged.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// Its topics cannot be chosen.
+    /// The topics of the file cannot be chosen.
     #[error(transparent)]
     Choice(#[from] ChoiceError),
 }

@@ -53,7 +53,7 @@ impl PoseGap {
         }
     }
 
-    /// A line for each source of which no scan is near a pose, for people; `name` names the source.
+    /// A line for people for each source without a scan near a pose; `name` names the source.
     pub(super) fn notes(&self, name: impl Fn(u16) -> String) -> Vec<String> {
         let far = self.scans.iter().filter_map(|(source, scan)| {
             scan.least_ns.filter(|least_ns| *least_ns > NEAR_NS)?;

@@ -12,7 +12,7 @@ pub struct ReplayClock {
     /// Speed relative to recorded time; infinite: as fast as possible.
     rate: f64,
     anchor: Option<Anchor>,
-    /// Recorded time from which it goes on; `None`: that of the next event.
+    /// Recorded time from which it goes on; `None`: the time of the next event.
     begins_ns: Option<i64>,
     lag: StampLag,
 }
@@ -68,7 +68,7 @@ impl ReplayClock {
         }
     }
 
-    /// Begins again at a recorded time; `None`: at that of the next event, whenever it comes.
+    /// Begins again at a recorded time; `None`: at the time of the next event, whenever it comes.
     pub fn restart(&mut self, at_ns: Option<i64>) {
         (self.anchor, self.begins_ns) = (None, at_ns);
     }

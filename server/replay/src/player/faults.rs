@@ -38,13 +38,13 @@ enum FaultKind {
     Stop,
 }
 
-/// A fault is not one of those that are known, or does not fit the drive.
+/// A fault is unknown, or does not fit the drive.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("fault {text:?}: {reason}; {SYNTAX}")]
 pub struct FaultError {
     /// The fault as given.
     pub text: String,
-    /// What is wrong with it.
+    /// Why the fault is refused.
     pub reason: String,
 }
 

@@ -11,7 +11,7 @@
 //! | [`play`] | readings, commands -> stepped engines |
 //!
 //! A jump goes back to a copy of the pipelines and applies every event from there to the requested moment without
-//! publishing, so its maps are those of a replay without jumps, with all that they remember.
+//! publishing, so its maps equal the maps of a replay without jumps, with all that they remember.
 
 pub mod clock;
 pub mod faults;

@@ -32,7 +32,7 @@ pub enum PlayError {
         "lockstep: map {sequence} of vehicle {vehicle} was not acknowledged within {seconds} s; awaited: {readers}"
     )]
     Unacknowledged {
-        /// The vehicle's name.
+        /// Name of the vehicle.
         vehicle: String,
         /// Sequence of the map.
         sequence: u64,

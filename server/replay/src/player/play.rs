@@ -72,7 +72,7 @@ struct AwaitedMap {
     since: Instant,
 }
 
-/// A replay.
+/// Plays the readings of all vehicles through their engines, at the rate of the clock.
 pub struct Player {
     timeline: Timeline,
     vehicles: Vec<ReplayedVehicle>,
@@ -192,7 +192,7 @@ impl Player {
     /// Steps the next reading, of recorded time `at_ns`, when it is due, unless a command comes before.
     fn wait_for(&mut self, at_ns: i64) -> Result<(), Interrupt> {
         if self.step.is_some() {
-            // A step is as fast as possible, and its stamps are those of the present.
+            // A step is as fast as possible, and its maps get stamps of the present.
             self.clock.restart(None);
         }
         let due = self.step.is_none().then(|| self.clock.due(at_ns, now_ns())).flatten();

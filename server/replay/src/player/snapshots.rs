@@ -36,7 +36,7 @@ impl Snapshots {
         last.is_none_or(|last| readings > last.readings && at_ns.saturating_sub(last.at_ns) >= self.period_ns)
     }
 
-    /// Adds a copy. If there are too many, every second one is dropped, and later ones are farther apart.
+    /// Adds a copy. If there are too many, every second copy is dropped, and later copies are farther apart.
     pub fn add(&mut self, snapshot: Snapshot) {
         self.copies.push(snapshot);
         if self.copies.len() > COPIES_MAX {

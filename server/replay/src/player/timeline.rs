@@ -20,9 +20,9 @@ const AHEAD: usize = 1024;
 /// The files of one vehicle, in the order of their times.
 #[derive(Clone, Debug)]
 pub struct Track {
-    /// The files.
+    /// Paths of the files, in the order of their times.
     pub files: Vec<PathBuf>,
-    /// What is read of them.
+    /// Options with which the files are read.
     pub options: McapOptions,
 }
 
@@ -44,7 +44,7 @@ pub struct TimedReading {
     pub vehicle: usize,
     /// Recorded time: the reading's arrival, without a step of the clock that is a fault.
     pub at_ns: i64,
-    /// The reading.
+    /// The reading that arrives at this time.
     pub reading: Reading,
     /// Messages of this vehicle that were refused before it became readings.
     pub refused: RefusedMessages,
@@ -53,7 +53,7 @@ pub struct TimedReading {
 /// What a timeline has beside its readings; known at its end.
 #[derive(Debug, Default)]
 pub struct Remarks {
-    /// The truncated files.
+    /// Files that are truncated or damaged.
     pub truncated: Vec<Truncated>,
     /// Topics and packets that were ignored or refused, for people.
     pub notes: Vec<String>,
@@ -124,7 +124,7 @@ enum Item {
     End(Remarks),
 }
 
-/// The readings of all vehicles, of which the next one may be looked at before it is taken.
+/// The readings of all vehicles. The next reading can be looked at before it is taken.
 pub struct Ahead {
     readings: Receiver<Result<Item, FilesError>>,
     next: Option<TimedReading>,
@@ -159,11 +159,11 @@ impl Ahead {
     }
 }
 
-/// The readings of several vehicles, each with the one that is next.
+/// The readings of several vehicles, each vehicle with its next reading.
 struct Merged {
     tracks: Vec<(Readings, Option<Reading>)>,
     faults: Faults,
-    /// Number of readings so far, with those that a fault has dropped.
+    /// Number of readings so far, with readings that a fault has dropped.
     number: u64,
     /// Recorded time of the first reading.
     begin_ns: Option<i64>,
@@ -183,7 +183,7 @@ impl Merged {
         Ok(None)
     }
 
-    /// The earliest of the vehicles' next readings; of equal times that of the first vehicle.
+    /// The earliest of the vehicles' next readings; at equal times the reading of the first vehicle.
     fn earliest(&mut self) -> Result<Option<TimedReading>, FilesError> {
         for (readings, next) in &mut self.tracks {
             if next.is_none() {

@@ -11,11 +11,11 @@ use crate::files::mcap::RefusedMessages;
 
 /// One vehicle of a replay.
 pub struct ReplayedVehicle {
-    /// Its engine.
+    /// Engine that makes the vehicle's maps.
     pub engine: Engine,
-    /// The events of its queue.
+    /// Receiver of the events on the engine's queue.
     pub events: Receiver<QueuedEvent>,
-    /// Its queue.
+    /// Event queue of the engine.
     pub queue: EventQueue,
 }
 

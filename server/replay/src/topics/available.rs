@@ -33,7 +33,7 @@ pub struct AvailableTopics {
     pub(super) topics: BTreeMap<String, Topic>,
     /// The newest transforms of all frames.
     pub(super) frames: Frames,
-    /// The static transforms.
+    /// The static transforms (`/tf_static`).
     pub(super) latched: Frames,
     /// Stamps of the other transforms, by child frame.
     moving: BTreeMap<String, Stamps>,

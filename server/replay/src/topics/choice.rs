@@ -28,9 +28,9 @@ pub enum ChoiceError {
     /// The file does not have a requested topic.
     #[error("{}: --topic {topic}: the file has: {known}", file.display())]
     Topic {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// The requested topic.
+        /// The topic that `--topic` names.
         topic: String,
         /// The topics of the file, with their types.
         known: String,
@@ -40,9 +40,9 @@ pub enum ChoiceError {
 /// The topic of a sensor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SensorTopic {
-    /// The topic.
+    /// Name of the topic.
     pub topic: String,
-    /// The frame of its messages.
+    /// Frame of the topic's messages.
     pub frame_id: String,
     /// The frame of the tf tree that is taken for it: itself, or the only one with its name in another namespace.
     pub placed_frame: String,
@@ -57,14 +57,14 @@ pub struct SensorTopic {
     pub is_merged: bool,
 }
 
-/// The chosen topics.
+/// The topics of a file from which a replay makes maps.
 #[derive(Clone, Debug)]
 pub struct TopicChoice {
     /// The topics of the sensors, by index of the sensor.
     pub sensors: Vec<SensorTopic>,
     /// The source of the ego poses.
     pub pose: Option<PoseSource>,
-    /// The vehicle's frame.
+    /// Name of the vehicle's frame.
     pub ego_frame: String,
     /// The frame of the poses; empty if there are none, or if they name none.
     pub fixed_frame: String,
@@ -104,7 +104,8 @@ impl AvailableTopics {
         let mut sensors: Vec<SensorTopic> =
             sensors.into_iter().map(|topic| self.sensor_topic(topic, &ego_frame)).collect();
         if !is_requested && sensors.iter().all(|sensor| sensor.ego_from_sensor.is_none()) {
-            // A replay can use one sensor that is not placed: the one that shows most, whichever sent first.
+            // A replay can use one sensor without extrinsics: the sensor with packets or most points, whichever sent
+            // first.
             let shown = |sensor: &SensorTopic| {
                 let found = &self.topics[&sensor.topic];
                 (found.kind == Kind::VelodyneScan, found.points)
@@ -121,8 +122,8 @@ impl AvailableTopics {
         Ok(TopicChoice { sensors, pose, ego_frame, fixed_frame, notes, latched: self.latched.clone() })
     }
 
-    /// The vehicle's frame: of those in the tf tree the one to which the frame of a sensor is joined; without tf the
-    /// child frame of the first odometry, else `base_link`.
+    /// The vehicle's frame: the frame of the tf tree to which the frame of a sensor is joined; without tf the child
+    /// frame of the first odometry, else `base_link`.
     fn ego_frame(&self) -> String {
         let names = self.frames.names();
         let candidates: Vec<&str> = EGO_FRAMES

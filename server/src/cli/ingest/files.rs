@@ -26,7 +26,7 @@ const PACKETS_NS: i64 = 20_000_000;
 /// Width of an RNDF lane without a width, in metres: 12 feet, the width of most lanes.
 const LANE_M: f64 = 12.0 * FOOT_M;
 
-/// Scans a second if the options do not give them: those of most rotating sensors at 600 rpm.
+/// Scans a second if the options do not give them, as of most rotating sensors at 600 rpm.
 const HZ: f64 = 10.0;
 
 /// The options that name the files to send and how to read them.

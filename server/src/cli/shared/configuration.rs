@@ -37,7 +37,7 @@ impl ConfigurationOptions {
         Ok(config)
     }
 
-    /// The overrides of the environment, and then those of the options, which take precedence.
+    /// The overrides of the environment, then the overrides of the options, which take precedence.
     pub fn overrides(&self) -> Vec<String> {
         let variables = std::env::vars_os();
         let variables =

@@ -19,7 +19,7 @@ use clearway_journal::verify::Report;
 
 /// What is checked of each recording.
 pub enum Check {
-    /// Its maps are those of its events.
+    /// That its maps are the maps of its events.
     Verify,
     /// What another configuration changes in its maps; without one, the recorded configuration with overrides.
     Config { config: Option<Box<NewConfig>>, set: Vec<String> },

@@ -60,7 +60,7 @@ impl DemoCar {
         let observer = {
             let (rig, halt, skipped, progress) = (rig.clone(), halt.clone(), new_skipped(), progress(newest));
             let (runtime, name) = (tokio::runtime::Handle::current(), name.to_owned());
-            // The poses of a car with one sensor are no earlier than its packets, on a machine that is late with those.
+            // The poses of a car with one sensor are no earlier than its packets, if the machine is late with packets.
             let firing_ns = rig.units.is_empty().then(|| newest_firing_ns.clone());
             let observe = move || runtime.block_on(observe(&name, rig, grpc, halt, firing_ns, progress, skipped));
             std::thread::Builder::new().name("simulated car".into()).spawn(observe)?
@@ -86,7 +86,7 @@ impl DemoCar {
         self.sensors.iter().any(JoinHandle::is_finished) || self.observer.is_finished()
     }
 
-    /// Simulated time skipped so far, because the machine is too slow: that of the sensor that skipped most.
+    /// Simulated time skipped so far by the sensor that skipped most, because the machine is too slow.
     pub fn skipped(&self) -> Duration {
         self.skipped.iter().map(Skipped::time).max().unwrap_or_default()
     }

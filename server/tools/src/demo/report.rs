@@ -33,7 +33,7 @@ pub struct DemoReport {
 pub struct DemoSummary {
     /// The last report, with complete counts.
     pub last: DemoReport,
-    /// What the cars sent.
+    /// Counts of what the cars sent.
     pub sent: Sent,
     /// Processor time of this process over the time, the simulation's too; `None` where the system does not tell it.
     pub cores: Option<f64>,
@@ -54,7 +54,7 @@ impl Default for DemoReport {
 }
 
 impl DemoReport {
-    /// The report that follows this one.
+    /// The report that follows this report.
     pub fn next(&self, elapsed: Duration, snapshot: Snapshot, age_ms: Option<f64>, skipped: Duration) -> Self {
         let newly_skipped = skipped.saturating_sub(self.skipped);
         Self { elapsed, snapshot, age_ms, skipped, newly_skipped, ..*self }

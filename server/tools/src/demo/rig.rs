@@ -24,8 +24,8 @@ const ROAD_PERIOD_NS: i64 = 100_000_000;
 /// sensor's window would return from nearer.
 const RANGE_M_MIN: f32 = 0.5;
 
-/// A car in a scene, and its sensors by name. The rotating ones come first in the configuration, and the first of them
-/// is the reference sensor.
+/// A car in a scene, and its sensors by name. The rotating sensors come first in the configuration, and the first of
+/// them is the reference sensor.
 #[derive(Clone, Debug)]
 pub struct Rig {
     /// The world, and the car's course through it.
@@ -43,7 +43,7 @@ pub struct Rig {
 pub struct TimedObservation {
     /// When it is sent, ns since the Unix epoch.
     pub stamp_ns: i64,
-    /// What is sent.
+    /// The observation that is sent at this time.
     pub observation: Observation,
 }
 
@@ -55,8 +55,8 @@ pub struct Observations<'a> {
     due: Vec<(i64, ObservationKind)>,
 }
 
-/// A kind of observation. The order is the one in which observations with one stamp are sent: poses before the scans
-/// that end with them, so that the scans are compensated by them.
+/// A kind of observation. Observations with one stamp are sent in this order: poses before the scans that end with
+/// them, so that the scans are compensated by them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum ObservationKind {
     Pose,
@@ -111,7 +111,7 @@ impl Rig {
         SimulatedVehicle::starting_at(self.scene.clone(), self.scanners[index].1.clone(), self.start_ns)
     }
 
-    /// The car's observations.
+    /// The car's poses, roads and scans, each with its period.
     pub fn observations(&self) -> Observations<'_> {
         let mut due = vec![(POSE_PERIOD_NS, ObservationKind::Pose)];
         due.extend(self.units.first().map(|_| (ROAD_PERIOD_NS, ObservationKind::Road)));

@@ -32,7 +32,7 @@ const SETTLE: Duration = Duration::from_millis(500);
 pub const RECORDING_MIB: u64 = 2048;
 /// As [`RECORDING_MIB`], of a black box.
 pub const BLACK_BOX_MIB: u64 = 256;
-/// The names of a fleet's vehicles; further ones have numbers.
+/// The names of a fleet's vehicles; further vehicles have numbers.
 const NAMES: [&str; 5] = ["car", "van", "truck", "bus", "shuttle"];
 /// From one vehicle of a fleet to the next along its course, in metres.
 const APART_M: f64 = 45.0;
@@ -41,7 +41,7 @@ const FAILING: usize = 1;
 const DRIVES: Duration = Duration::from_secs(60);
 const FAILS: Duration = Duration::from_secs(20);
 
-/// What a demo does.
+/// Options of a demo.
 #[derive(Clone, Debug, Default)]
 pub struct DemoOptions {
     /// How long the demo runs; `None`: until `stop` resolves.
@@ -52,7 +52,7 @@ pub struct DemoOptions {
     pub black_box: bool,
     /// The file that the newest map is drawn to every second; `None`: nothing is drawn.
     pub picture: Option<PathBuf>,
-    /// The car's sensors.
+    /// The sensors with which the car drives.
     pub sensors: DemoSensors,
     /// Number of vehicles; one of several fails after a minute and comes back. 0 is 1.
     pub vehicles: usize,
@@ -67,11 +67,11 @@ pub struct DemoEndpoints {
     pub page: SocketAddr,
     /// The address of gRPC.
     pub grpc: SocketAddr,
-    /// zenoh's endpoints.
+    /// The endpoints on which zenoh listens.
     pub zenoh: Vec<String>,
     /// The sensors, and why they were chosen.
     pub sensors: String,
-    /// Ports that differ from the usual ones, and why.
+    /// Ports that differ from the usual ports, and why.
     pub notes: Vec<String>,
 }
 

@@ -32,7 +32,7 @@ pub enum DemoSensors {
 /// The sensor on the roof that was chosen, and why.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SensorChoice {
-    /// The model.
+    /// The chosen model.
     pub model: Model,
     /// Share of one core that simulating it takes, as measured for each model that was tried, the chosen one last.
     /// Empty if the model was given.
@@ -49,7 +49,7 @@ const SHARE_MAX: f64 = 0.25;
 const MEASURED: Duration = Duration::from_millis(200);
 
 impl SensorChoice {
-    /// The model that `sensors` names, or the one that this machine can afford.
+    /// The model that `sensors` names, or a model that this machine can afford.
     pub fn new(sensors: DemoSensors) -> Self {
         let given = |model| Self { model, core_shares: Vec::new() };
         match sensors {
@@ -60,7 +60,8 @@ impl SensorChoice {
         }
     }
 
-    /// The first model that takes no more than [`SHARE_MAX`] of all cores; the one with the fewest lasers if none does.
+    /// The first model that takes no more than [`SHARE_MAX`] of all cores; the model with the fewest lasers if none
+    /// does.
     fn affordable(core_share: impl Fn(Model) -> f64) -> Self {
         let cores = available_parallelism().map_or(1, usize::from) as f64;
         let mut core_shares = Vec::new();

@@ -4,8 +4,8 @@
 //! does not depend on where the truth comes from (labels or a simulated world).
 //!
 //! The points in a cell vote for its truth; points more than 2.5 m above the ground do not vote. A point of an obstacle
-//! makes the cell an obstacle. Otherwise the most frequent of forbidden, either and drivable wins, and in a tie the one
-//! named first here. Precision is the share of the cells called drivable, and seen by a point, that are neither
+//! makes the cell an obstacle. Otherwise the most frequent of forbidden, either and drivable wins, and in a tie the
+//! answer named first here. Precision is the share of the cells called drivable, and seen by a point, that are neither
 //! obstacle nor forbidden. Recall is the share of the drivable cells that are called drivable. A point is called ground
 //! if its cell is called drivable and it lies at most [`GROUND_OVER_LOWEST_M`] above the cell's lowest point, or, by an
 //! estimate of the ground, if it lies within [`GROUND_OFF_M_MAX`] of that. Points outside the layer's grid are not
@@ -41,7 +41,7 @@ pub enum Vote {
     Either,
     /// Ground that a vehicle can reach and drive on.
     Drivable,
-    /// An obstacle.
+    /// An obstacle, on which a vehicle cannot drive.
     Obstacle,
 }
 

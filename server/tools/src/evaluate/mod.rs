@@ -69,11 +69,11 @@ pub fn evaluate(options: &EvaluateOptions, mut progress: impl FnMut(u64, u64) + 
 
 /// What one path stands for.
 enum Input {
-    /// A simulated scene.
+    /// `sim:NAME`: a simulated scene.
     World(&'static NamedScene),
-    /// Random worlds.
+    /// `sim:random`: random worlds.
     Random,
-    /// Labelled scans.
+    /// A path: labelled scans.
     Labelled(LabelledScans),
 }
 

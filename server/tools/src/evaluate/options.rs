@@ -14,7 +14,7 @@ use super::source::variation::Variation;
 /// in odd seeds.
 pub const SEEDS: Range<u64> = 0..156;
 
-/// What is judged, and how.
+/// Options of an evaluation: inputs, configuration and outputs.
 #[derive(Clone, Debug)]
 pub struct EvaluateOptions {
     /// Folders with scans and labels, scans, `sim:` with the name of a scene, or `sim:random`.
@@ -30,11 +30,11 @@ pub struct EvaluateOptions {
     pub variations: Vec<Variation>,
     /// True if objects are cut into each labelled scan as it was recorded, and their cells are counted.
     pub objects: bool,
-    /// Folder to which each scan and its truth is written, but not those of `sim:` other than `sim:random`.
+    /// Folder to which each scan and its truth is written, except scans of `sim:` other than `sim:random`.
     pub write_scans: Option<PathBuf>,
     /// Seeds of the random worlds.
     pub seeds: Range<u64>,
-    /// Configuration of the maps, those of its first vehicle; the default configuration if `None`.
+    /// Configuration file, whose first vehicle configures the maps; `None`: the default configuration.
     pub config: Option<PathBuf>,
     /// Overrides of keys of the configuration.
     pub set: Vec<String>,

@@ -58,7 +58,8 @@ pub struct EvaluatedRow {
 pub struct FrameTruth<'a> {
     /// The points of the sweep.
     pub points: &'a [JudgedPoint],
-    /// The points from which the truth of footprints is made: the same, or those of a scan with more lasers.
+    /// The points from which the truth of footprints is made: the same points, or the points of a scan with more
+    /// lasers.
     pub whole: &'a [JudgedPoint],
     /// Places whose truth is known without a return.
     pub known: &'a [KnownPlace],
@@ -127,7 +128,7 @@ impl EvaluatedRow {
     }
 }
 
-/// Counts by object, distance in metres and layer: the cells with the object in them, and those called free.
+/// Counts by object, distance in metres and layer: the cells with the object in them, and how many are called free.
 pub type ObjectCounts = BTreeMap<(&'static str, u32), Vec<(String, CellCount)>>;
 
 /// The counts of a layer, which are made if there are none.
@@ -146,9 +147,9 @@ pub struct EvaluatedWorld {
     pub seed: u64,
     /// Theme and form.
     pub name: String,
-    /// What was drawn.
+    /// The drawn ground and objects in words.
     pub description: String,
-    /// Its counts.
+    /// Counts of the world's cells and points.
     pub row: EvaluatedRow,
 }
 
@@ -161,8 +162,8 @@ pub struct EvaluatedSource {
     pub unlabelled: usize,
     /// For each folder the extrinsics of the sensor, and where they come from.
     pub mounts: Vec<String>,
-    /// The counts of each variation, the first of which is the scans as they were recorded; or the sum of all worlds,
-    /// then each type of world.
+    /// The counts of each variation, first of the scans as they were recorded; or the sum of all worlds, then each type
+    /// of world.
     pub rows: Vec<EvaluatedRow>,
     /// The cells of objects that were cut into the scans.
     pub objects: ObjectCounts,
@@ -207,7 +208,7 @@ impl Evaluation {
         failures
     }
 
-    /// The report as a JSON object; a share of zero cells or points is null. `maps` of a source are those of its first
+    /// The report as a JSON object; a share of zero cells or points is null. `maps` of a source describes its first
     /// row.
     pub fn to_json(&self) -> Value {
         let source = |source: &EvaluatedSource| {

@@ -6,7 +6,7 @@ use super::footprint::tally as footprint_tally;
 use super::report::{EvaluatedRow, EvaluatedSource, Evaluation, PROTOCOLS};
 use super::tally::{BANDS, BANDS_M, CellCount, Tally};
 
-/// Number of worlds that are listed for each layer, those with the most wrong cells first.
+/// Number of worlds that are listed for each layer, worlds with the most wrong cells first.
 const WORST: usize = 5;
 
 impl Evaluation {

@@ -12,12 +12,12 @@ pub fn band(range_m: f32) -> Option<usize> {
     (range_m < BANDS_M[BANDS]).then(|| BANDS_M[1..].partition_point(|bound| *bound <= range_m))
 }
 
-/// Number of cells of a kind, and of those among them for which something is true.
+/// Number of cells of a kind, and of the cells among them for which something is true.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CellCount {
     /// Number of cells of the kind.
     pub all: u64,
-    /// Number of those for which it is true.
+    /// Number of cells among them for which it is true.
     pub of_them: u64,
 }
 
@@ -83,19 +83,19 @@ pub struct Tally {
     pub called: u64,
     /// Number of cells called drivable that are obstacle or forbidden.
     pub called_wrongly: u64,
-    /// Number of cells called drivable that a point has seen, and of those that are obstacle or forbidden, by band of
+    /// Number of cells called drivable that a point has seen, and of obstacle or forbidden cells among them, by band of
     /// range.
     pub wrong_by_range: [CellCount; BANDS],
     /// Number of cells called drivable that have a point of an obstacle.
     pub leaking: u64,
-    /// Number of drivable cells, and of those that are called drivable.
+    /// Number of drivable cells, and of cells among them that are called drivable.
     pub drivable: CellCount,
-    /// Number of drivable cells, and of those whose class means that they are free and not reached.
+    /// Number of drivable cells, and of cells among them whose class means that they are free and not reached.
     pub not_reached: CellCount,
-    /// Number of road cells without obstacle, and of those that are called drivable.
+    /// Number of road cells without obstacle, and of cells among them that are called drivable.
     pub road: CellCount,
-    /// Number of cells with ground and without an obstacle, and of those that are called occupied. Ground that is too
-    /// steep is left out.
+    /// Number of cells with ground and without an obstacle, and of cells among them that are called occupied. Ground
+    /// that is too steep is left out.
     pub ground: CellCount,
     /// The same for cells in which every point is ground.
     pub pure_ground: CellCount,

@@ -62,7 +62,7 @@ fn a_hand_made_street_gets_the_metrics_counted_by_hand() {
     assert_eq!(tally.drivable.of_them + tally.not_reached.of_them, tally.drivable.all);
     assert!(tally.not_reached.of_them <= 4 && tally.road_recall() > Some(0.999), "{tally:?}");
     assert!(tally.leaks.is_empty(), "{:?}", tally.leaks);
-    // Every ground point, road or terrain, except those in the cells of the wall; no point of the wall.
+    // Every ground point, road or terrain, except points in the cells of the wall; no point of the wall.
     let ground = points.iter().filter(|(_, class)| *class != 50).count() as u64;
     for protocol in tally.points {
         assert_eq!((protocol.right + protocol.missed, protocol.wrong), (ground, 0));
@@ -174,7 +174,7 @@ fn each_variation_has_a_row_and_its_points_are_written() {
     let rows = &report.sources[0].rows;
     let names: Vec<(&str, bool)> = rows.iter().map(|row| (row.name.as_str(), row.final_only)).collect();
     assert_eq!(names, [("bend-6", false), ("roll+3", false), ("offset+1.5", false)]);
-    // The truth is that of the scan as recorded, so as many points of it are road and wall.
+    // The truth comes from the scan as recorded, so as many points of it are road and wall.
     let scored = |row: &report::EvaluatedRow| row.layer("drivability").unwrap().points[0];
     for row in rows {
         let ground = scored(row).right + scored(row).missed;

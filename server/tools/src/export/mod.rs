@@ -28,10 +28,10 @@ mod plans;
 mod scans;
 mod viewer_file;
 
-/// What is exported, and where to.
+/// Options of an export: recording, layers, format and target.
 #[derive(Clone, Debug)]
 pub struct ExportOptions {
-    /// The recording (MCAP).
+    /// Path of the recording, an MCAP file.
     pub recording: PathBuf,
     /// Names of the layers; all if empty.
     pub layers: Vec<String>,
@@ -62,7 +62,7 @@ pub enum ExportFormat {
     Ros2,
 }
 
-/// What was exported.
+/// Counts of what was exported.
 #[derive(Clone, Debug, Default)]
 pub struct Exported {
     /// Number of maps, by layer.
@@ -179,7 +179,7 @@ impl ExportOptions {
 /// Exports the maps of a recording. `progress` is called with the bytes read and the number of maps exported.
 ///
 /// # Errors
-/// If a file cannot be read or written; for an unknown layer or vehicle with the names of those in the recording.
+/// If a file cannot be read or written; for an unknown layer or vehicle, with the names in the recording.
 pub fn export(options: &ExportOptions, mut progress: impl FnMut(u64, u64)) -> Result<Exported> {
     let ExportOptions { recording: file, out, .. } = options;
     files::open(file)?;

@@ -1,7 +1,7 @@
 //! The events of a recording -> the scans of each sensor, decoded again: points in the sensor frame.
 //!
-//! The sensors are those of the recorded configuration and calibrations. The points are not compensated for the motion
-//! of the vehicle, and those that the maps leave out (the vehicle itself, blind sectors) are in the scans.
+//! The sensors come from the recorded configuration and calibrations. The points are not compensated for the motion of
+//! the vehicle, and include points that the maps leave out (the vehicle itself, blind sectors).
 
 use std::collections::BTreeMap;
 
@@ -26,7 +26,7 @@ pub struct DecodedScan<'a> {
     pub stamp_ns: i64,
     /// Position and orientation of the sensor in the ego frame.
     pub ego_from_sensor: &'a Isometry3<f64>,
-    /// Its points.
+    /// The points in the sensor frame.
     pub points: ScanPoints,
 }
 
@@ -108,7 +108,7 @@ impl ScanDecoder {
         let event = v1::Event::decode(event).with_context(|| format!("journal of {vehicle}"))?;
         let index = event.source as usize;
         if let Some(Body::Sensor(sensor)) = &event.body {
-            // A repeated declaration changes nothing; another one at its index follows its withdrawal.
+            // A repeated declaration changes nothing; another declaration at its index follows its withdrawal.
             let is_known = |known: &OneSensor| known.declaration.as_ref().is_none_or(|known| known == sensor);
             if !sensors.get(&index).is_some_and(is_known) {
                 let ahead_ns_max = sensors.values().next().map_or(0, |first| first.ahead_ns_max);

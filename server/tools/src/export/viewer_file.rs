@@ -6,7 +6,7 @@
 //! other topics ([`ros::topics_of`]), `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`),
 //! `/clearway/<vehicle>/odometry` (`nav_msgs/msg/Odometry`), `/clearway/<vehicle>/plan` (`nav_msgs/msg/Path`) and `/tf`
 //! (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording, and the stamp of the capture's or the
-//! scan's end. With points the poses of ros2 are the recorded ones with their own stamps, so that a replay of the file
+//! scan's end. With points the poses of ros2 are the recorded poses with their own stamps, so that a replay of the file
 //! has the poses of the drive; without points they are the poses of the maps.
 
 use std::collections::{BTreeMap, HashMap, HashSet};

@@ -8,7 +8,7 @@ pub const LETTER: usize = 8;
 /// Dots of a character that the font does not have: a filled box.
 const BOX: [u8; LETTER] = [0xff; LETTER];
 
-/// A picture.
+/// A picture of pixels in memory, which can be encoded as a PNG.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
     /// Width, in pixels.
@@ -65,7 +65,7 @@ impl Picture {
         }
     }
 
-    /// Copies a picture into this one, which is large enough.
+    /// Copies a picture into this picture, which is large enough.
     pub fn place(&mut self, (x, y): (usize, usize), picture: &Self) {
         for (row, pixels) in picture.rgb.chunks(picture.width.max(1)).enumerate() {
             self.rgb[(y + row) * self.width + x..][..picture.width].copy_from_slice(pixels);

@@ -22,7 +22,7 @@ const SCALE_SHARE: f64 = 0.25;
 /// What stands before the text of a line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Swatch {
-    /// Nothing.
+    /// No mark; the text begins at the left.
     None,
     /// A square of this colour.
     Colour(Rgb),

@@ -29,7 +29,7 @@ use legend::Swatch;
 
 /// Colour of the vehicle's mark.
 const VEHICLE: Rgb = [244, 244, 248];
-/// Half the length and half the width of the vehicle's mark, in metres: those of a car.
+/// Half the length and half the width of the vehicle's mark, in metres, as of a car.
 const VEHICLE_HALF_M: (f64, f64) = (2.2, 0.9);
 /// Colours of the links of safe points, and of the circles with their radii.
 const LINK: Rgb = [255, 225, 77];

@@ -4,11 +4,10 @@
 //!   cargo run --release -p clearway-tests --bin machines
 //!   cargo run --release -p clearway-tests --bin machines -- --faults cut,clock-behind --seconds 3
 //!
-//! Each planner reads every vehicle over zenoh, at both routers at once. For each fault the table has, of all
-//! streams, how many went STALE while
-//! it lasted, of those it concerns and of the others; how long the longest of the others was; the time from the repair
-//! until every stream was fresh again; how many streams had maps of another run of a server than before; and why the
-//! concerned streams said they were stale, with their number.
+//! Each planner reads every vehicle over zenoh, at both routers at once. For each fault the table has how many streams
+//! went STALE while it lasted, counted apart for the streams that it concerns and for the other streams; how long the
+//! longest other stream was STALE; the time from the repair until every stream was fresh again; how many streams had
+//! maps of another run of a server than before; and why the concerned streams said they were stale, with their number.
 //!
 //! `--uplink`: the thin uplink of a vehicle instead (`uplink.rs`).
 //!

@@ -273,7 +273,7 @@ fn figures(lines: &[Shown], from: Instant) -> String {
     let share = |of: f64| 100.0 * of / maps.len().max(1) as f64;
     let mut ages: Vec<f64> = maps.iter().map(|shown| shown.age_ms).collect();
     ages.sort_by(f64::total_cmp);
-    // The state before the first line is that of the line before.
+    // The state before the first line is the state of the line before.
     let first = lines.partition_point(|shown| shown.at < from);
     let ends = lines[first..].iter().map(|shown| shown.at).chain([now]);
     let states = lines[first.saturating_sub(1)..].iter().zip(ends.skip(usize::from(first == 0)));

@@ -48,7 +48,7 @@ fn built(buildah: &Buildah) -> PathBuf {
     debian.args(["--quiet", "--variant=minbase", RELEASE]).arg(&base);
     for list in ["/etc/apt/sources.list.d/debian.sources", "/etc/apt/sources.list"].map(Path::new) {
         let Some(text) = fs::read_to_string(list).ok().filter(|text| !text.is_empty()) else { continue };
-        // The mirrors of this machine, whose own release may be another one.
+        // The mirrors of this machine, whose own release may differ.
         let of_release = buildah.0.join(list.file_name().expect("it has a name"));
         fs::write(&of_release, text.replace("bookworm", RELEASE)).expect("a file of ours");
         debian.arg(of_release);

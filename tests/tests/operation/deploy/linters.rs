@@ -66,7 +66,7 @@ fn the_compose_file_follows_the_compose_specification_and_its_configuration_is_v
     succeeds(linter("check-jsonschema").args(schema));
     let checked = run(&workspace(), "clearway", &["check", "--config", "deploy/container/clearway.toml"]);
     assert!(checked.status.success(), "{}", said(&checked));
-    // The addresses of the compose file are those of the configuration.
+    // The compose file has the addresses of the configuration.
     let compose = fs::read_to_string(workspace().join("deploy/container/compose.yaml")).expect("readable");
     for sender in ["172.30.57.11", "172.30.57.12"] {
         assert!(compose.contains(&format!("ipv4_address: {sender}\n")) && said(&checked).contains(sender), "{sender}");
@@ -91,7 +91,7 @@ fn the_ci_examples_follow_the_schemas_of_github_and_gitlab_and_zizmor_finds_noth
         fs::write(&wrong, text.expect("readable").replace(key, "unknown_key")).expect("a file of ours");
         assert!(!follows(schema, &wrong).output().expect("it starts").status.success(), "{schema} knows {key}");
     }
-    // It takes a folder for that of workflows by its name only.
+    // zizmor knows the folder of workflows by its name only.
     let workflows = folder.path().join(".github/workflows");
     fs::create_dir_all(&workflows).expect("a folder of ours");
     fs::copy(workspace().join("deploy/ci/github.yml"), workflows.join("maps.yml")).expect("copied");

@@ -209,11 +209,11 @@ fn a_cut_chunk_is_found_whatever_else_is_damaged() {
         let codes = (info.0, repair.0, verify.0, verify_repaired.0);
         assert!(codes == (Some(2), Some(1), Some(2), Some(0)), "{chunk}: {codes:?} {} {}", verify.1, verify_repaired.1);
     }
-    // The one that describes the channels, which the summary describes too.
+    // The chunk that describes the channels, which the summary describes too.
     let [_, repair, ..] = commands_on(|bytes| cut(bytes, 0));
     assert!(repair.0 == Some(1) && !repair.1.contains("b.mcap has 0"), "{}", repair.1);
     assert!(!repair.1.contains("does not describe"), "{}", repair.1);
-    // Two recordings, of which the first lacks its last bytes and the second its first.
+    // Two recordings: the first lacks its last bytes, the second its first bytes.
     let [_, repair, ..] = commands_on(|bytes| {
         bytes.truncate(bytes.len() - 8);
         bytes.extend(in_chunks()[8..].to_vec());

@@ -40,7 +40,7 @@ fn records(bytes: &[u8], kind: u8) -> Vec<usize> {
     damage::records(bytes).into_iter().filter(|(of, _)| *of == kind).map(|(_, at)| at).collect()
 }
 
-/// The recording of the first version of format 1, whose maps are those of that version.
+/// The recording of the first version of format 1, with maps of that version.
 fn oldest() -> PathBuf {
     workspace().join("tests/golden/format_1.mcap")
 }
@@ -57,7 +57,7 @@ fn the_golden_recordings_are_read_by_every_version() {
     assert!(said.contains(" recorded the file, "), "{said}");
 }
 
-/// Reads all events and maps of a golden recording, whose program had these layers beside the first ones.
+/// Reads all events and maps of a golden recording, whose program had these layers beside the first layers.
 fn read_whole(file: &Path, more_layers: &[&str]) {
     let mut recording = RecordingReader::open(file).unwrap();
     let (config, tables) = run_config(&recording).unwrap();
@@ -117,8 +117,8 @@ fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
     runner.run(&change, |(at, bit)| copy.flip(&original, at, bit).map(drop).map_err(TestCaseError::fail)).unwrap();
     // The heads of some records have few of all bytes, but all of the framing.
     let bytes = in_chunks();
-    // The name of the metadata, a digit of its boot id, and the kind of the record that ends the data: no checksum but
-    // that of the whole section covers them.
+    // The name of the metadata, a digit of its boot id, and the kind of the record that ends the data: only the
+    // checksum of the whole section covers them.
     let (metadata, data_end) = (records(&bytes, op::METADATA)[0], records(&bytes, op::DATA_END)[0]);
     let digit = bytes.windows(7).position(|text| text == b"boot_id").unwrap() + 7 + 4;
     // Bit 0 of a digit, so that it becomes another digit in every boot id.
@@ -391,7 +391,7 @@ fn a_repair_believes_neither_damaged_counts_nor_times_outside_of_a_chunk() {
         // The greatest byte of the first time of the index behind it.
         let index = *records(bytes, op::MESSAGE_INDEX).iter().find(|at| **at > chunk).unwrap();
         bytes[index + 9 + 2 + 4 + 7] = 0xff;
-        // The count of the summary becomes what can be read; that of the recorder is in a chunk.
+        // The count of the summary becomes what can be read; the recorder's count is in a chunk.
         let statistics = records(bytes, op::STATISTICS)[0];
         bytes[statistics + 9..statistics + 17].fill(0);
     });

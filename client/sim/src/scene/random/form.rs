@@ -26,7 +26,7 @@ pub enum Form {
 }
 
 impl Form {
-    /// All forms.
+    /// All forms, in the order of the enum.
     pub const ALL: [Self; 6] = [Self::Level, Self::Grade, Self::Crest, Self::Dip, Self::Banked, Self::Rolling];
 
     /// Name of the form, as `evaluate` prints it.

@@ -4,7 +4,7 @@
 //! mount of a sensor. The same seed gives the same world. Seeds 0 to 155 have every form with every theme once in the
 //! even seeds and once in the odd seeds.
 //!
-//! Parameters are tuned on even seeds only; figures of odd seeds are then those of worlds that were not tuned on.
+//! Parameters are tuned on even seeds only; figures of odd seeds are then figures of worlds that were not tuned on.
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -32,18 +32,18 @@ use super::scenes::Scene;
 use super::world::World;
 use draw::Draw;
 
-/// A random world.
+/// A world made from a seed: a theme on a form, with objects.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RandomWorld {
     /// Seed of the world.
     pub seed: u64,
-    /// Form of its ground.
+    /// Form of the ground.
     pub form: Form,
-    /// What stands in it.
+    /// Theme: the kind of objects in the world.
     pub theme: Theme,
-    /// What was drawn, with its measures.
+    /// The drawn ground and objects in words, with their measures.
     pub description: String,
-    /// The world, in which the vehicle stands still. Its name is that of the theme.
+    /// The world, in which the vehicle stands still. Its name is the theme's name.
     pub scene: Scene,
     /// Mount of the sensor: 1.6 to 2.2 m over the ground, up to 1.5 m ahead of the ego frame's origin and up to 0.3 m
     /// beside it.

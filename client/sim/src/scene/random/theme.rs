@@ -42,7 +42,7 @@ pub enum Theme {
 }
 
 impl Theme {
-    /// All themes.
+    /// All themes, in the order of the enum.
     pub const ALL: [Self; 13] = [
         Self::Kerbs,
         Self::Ditch,
@@ -78,7 +78,7 @@ impl Theme {
         }
     }
 
-    /// The kerbs or ditches of the theme, as heights across the road over those of the form, and a description.
+    /// The kerbs or ditches of the theme, as heights across the road over the form's heights, and a description.
     pub(super) fn edges(self, draw: &mut Draw) -> (Profile, String) {
         match self {
             Self::Kerbs | Self::Mixed => kerbs(draw),

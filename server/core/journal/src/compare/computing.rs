@@ -14,12 +14,12 @@ pub(super) struct Computing {
     pub boot_id: u64,
     pub valid_ms: u32,
     pub pipeline: Pipeline,
-    /// Sequence from which events are new; earlier ones are repeated for a keyframe.
+    /// Sequence from which events are new; earlier events are repeated for a keyframe.
     pub next_event: u64,
 }
 
 impl Computing {
-    /// True if events between the last one and this one are missing. A part of a recording may begin with any event.
+    /// True if events between the last event and `event` are missing. A part of a recording may begin with any event.
     pub fn lacks_events_before(&self, event: &Event) -> bool {
         self.next_event > 0 && event.sequence > self.next_event
     }

@@ -1,6 +1,6 @@
 //! [`Event`] <-> `clearway.v1.Event`: events of the journal, and bodies of observations.
 //!
-//! An event read from a journal equals the event that was written, also one that the core refuses.
+//! An event read from a journal equals the event that was written, also if the core refuses the event.
 
 use bytes::Bytes;
 use clearway_lidar::model::Model;
@@ -66,7 +66,7 @@ pub fn road_from_proto(road: v1::Road) -> Result<Road, NoCounterpartError> {
 /// An ego pose from the wire; `None` if the pose is missing.
 pub fn ego_pose_from_proto(ego: &v1::EgoPose) -> Option<EgoPose> {
     let pose = ego.map_from_ego.as_ref()?;
-    // Not normalised again: rounding would give another pose than the one that was processed.
+    // Not normalised again: rounding would change the pose that was processed.
     let rotation = Unit::new_unchecked(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
     let map_from_ego = Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation);
     Some(EgoPose { stamp_ns: ego.stamp_ns, map_from_ego, speed_mps: ego.speed_mps })
@@ -226,7 +226,7 @@ pub enum EventDecodeError {
     },
 }
 
-/// An event from a journal, equal to the one that was written.
+/// An event from a journal, equal to the event that was written.
 ///
 /// # Errors
 /// [`EventDecodeError::Decode`] if the bytes are not protobuf, [`EventDecodeError::Source`] if the source is too large,

@@ -100,8 +100,8 @@ impl EncodedMap {
         message.freeze()
     }
 
-    /// The encoded map with these layers (every layer if `layers` is empty), cropped to `region`, each as a delta
-    /// against that of `base` if the delta is shorter.
+    /// The encoded map with these layers (every layer if `layers` is empty), cropped to `region`. A layer is a delta
+    /// against the same layer of `base` if the delta is shorter.
     ///
     /// # Errors
     /// [`RegionError`] if the region lies outside a layer's grid.

@@ -14,8 +14,8 @@ use clearway_proto::region::{RegionError, crop};
 use clearway_proto::v1;
 use prost::Message;
 
-/// Most payloads kept for one map; further ones are encoded for each reader. Ours: ten readers with regions of their
-/// own, seven layers each.
+/// Most payloads kept for one map; further payloads are encoded for each reader. Ours: ten readers with regions of
+/// their own, seven layers each.
 const PAYLOADS_MAX: usize = 64;
 
 /// Payloads of one map, by layer, region and base.

@@ -13,11 +13,11 @@ use serde_json::{Value, json};
 /// A difference between a recording and the maps of its events.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Difference {
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub vehicle: String,
     /// Sequence of the map.
     pub sequence: u64,
-    /// The layer's name.
+    /// Name of the layer that differs.
     pub layer: String,
     /// The first difference of the map.
     pub kind: DifferenceKind,
@@ -26,13 +26,13 @@ pub struct Difference {
 /// The kind of a difference.
 #[derive(Clone, Debug, PartialEq)]
 pub enum DifferenceKind {
-    /// A cell differs.
+    /// A cell has another value in the recording than in the computed map.
     Cell {
         /// Row of the grid.
         row: u32,
         /// Column of the grid.
         column: u32,
-        /// The channel's name.
+        /// Name of the channel that differs.
         channel: String,
         /// Raw value in the recording.
         recorded: i32,

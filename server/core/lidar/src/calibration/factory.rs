@@ -1,8 +1,8 @@
 //! The factory tables: nominal angles of every model, in firing order.
 //!
 //! Sources: the tables of elevations (and azimuth offsets) in the manuals of HDL-32E, VLP-16, Puck Hi-Res, VLP-32C and
-//! VLS-128. Each HDL-64E is measured individually; its table here is nominal: evenly spaced elevations between those of
-//! the manual, the order of lasers of real units, and azimuth offsets that are rounded from published units.
+//! VLS-128. Each HDL-64E is measured individually; its table here is nominal: evenly spaced elevations between the
+//! limits in the manual, the order of lasers of real units, and azimuth offsets that are rounded from published units.
 
 use super::table::{Calibration, LaserCalibration};
 use crate::model::Model;
@@ -104,10 +104,10 @@ const HDL64E_FROM_LOWEST: [usize; 32] = [
     6, 7, 10, 11, 0, 1, 4, 5, 8, 9, 14, 15, 18, 19, 22, 23, 12, 13, 16, 17, 20, 21, 26, 27, 30, 31, 2, 3, 24, 25, 28,
     29,
 ];
-/// Azimuth offsets of the upper block of an HDL-64E, in degrees: that of the first laser of each pair, from the lowest
-/// pair up, repeated after six pairs; and the difference from the first to the second laser of a pair.
+/// Azimuth offsets of the upper block of an HDL-64E, in degrees: the offset of the first laser of each pair, from the
+/// lowest pair up, repeated after six pairs; and the difference from the first to the second laser of a pair.
 const HDL64E_UPPER_ROTATION: ([f64; 6], f64) = ([-1.0, 3.25, -4.5, -0.25, 4.0, -5.25], 2.25);
-/// Azimuth offsets of the lower block of an HDL-64E, in degrees, as those of the upper block.
+/// Azimuth offsets of the lower block of an HDL-64E, in degrees, listed as in [`HDL64E_UPPER_ROTATION`].
 const HDL64E_LOWER_ROTATION: ([f64; 6], f64) = ([-1.75, 5.25, -7.5, -0.5, 6.25, -8.5], 3.5);
 
 fn hdl64e() -> Vec<(f64, f64)> {

@@ -3,7 +3,7 @@
 //! In: the status type and value at the end of every packet. Out: the [`Calibration`], after 4,160 packets (about 1.2
 //! s) without a loss. Source: HDL-64E S3 manual 63-HDL64ES3 rev K, appendix E. A cycle is 16 packets: the types H M S D
 //! N Y G T V with clock, GPS, temperature and firmware, then seven bytes of the table. The table is 260 cycles, 1,820
-//! bytes: `UNIT#` and two thresholds; 28 bytes per laser, of which 21 are used; 21 bytes about the unit. It ends with a
+//! bytes: `UNIT#` and two thresholds; 28 bytes per laser, 21 of them used; 21 bytes about the unit. It ends with a
 //! CRC-16 over the lasers (S3, which also marks every fourth cycle with W) or with its own length (S2).
 
 use super::table::{Calibration, LaserCalibration};
@@ -140,8 +140,8 @@ fn crc(table: &[u8]) -> u16 {
 }
 
 /// Status type and value of [`PACKETS_PER_TABLE`] packets with the bytes of `calibration`, rounded to hundredths of a
-/// degree and millimetres. An encoder sends them again and again. The status bytes are those of an HDL-64E S3 (W and
-/// CRC) for `Hdl64eS3`, and those of an S2 for every other model. A missing near-range correction is sent as
+/// degree and millimetres. An encoder sends them again and again. For `Hdl64eS3` the status bytes have the form of an
+/// S3 (W and CRC), for every other model the form of an S2. A missing near-range correction is sent as
 /// `dist_correction`.
 ///
 /// # Panics

@@ -17,7 +17,7 @@ pub struct Calibration {
     pub lasers: Vec<LaserCalibration>,
 }
 
-/// The corrections of one laser. The field names are those of ROS `velodyne_pointcloud`.
+/// The corrections of one laser, with the field names of ROS `velodyne_pointcloud`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct LaserCalibration {

@@ -28,7 +28,7 @@ pub struct Datagram {
     pub source: SocketAddr,
     /// Port of the receiver: 2368 for data, 8308 for telemetry in the factory settings.
     pub destination_port: u16,
-    /// UDP payload.
+    /// Payload of the UDP datagram, without headers.
     pub payload: Vec<u8>,
 }
 

@@ -65,7 +65,7 @@ pub enum DatagramError {
         /// Packet periods by which a packet may be late.
         packets_max: usize,
     },
-    /// The device time does not follow that of the packet before, and no second packet has confirmed it yet.
+    /// The device time does not follow the device time of the packet before, and no second packet has confirmed it yet.
     #[error(
         "the packet of {}, azimuth {azimuth} does not follow the one of {}: the next packet must confirm it",
         device_time(.device_us),

@@ -27,7 +27,7 @@ pub enum NmeaError {
     /// A byte is not printable ASCII.
     #[error("byte {byte:#04x} at {at} of the sentence; printable ASCII is allowed")]
     Byte {
-        /// The byte.
+        /// The byte that is not allowed.
         byte: u8,
         /// Index of the byte in the sentence, from 0.
         at: usize,

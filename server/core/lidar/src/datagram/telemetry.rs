@@ -47,7 +47,7 @@ impl Telemetry {
     /// # Errors
     /// - [`DatagramError::Length`] if the payload has not 512 bytes.
     /// - [`DatagramError::Nmea`] if there is a sentence and it is damaged.
-    /// - [`DatagramError::Telemetry`] if there is no sentence and the other fields are not those of a sensor.
+    /// - [`DatagramError::Telemetry`] if there is no sentence and the other fields are not as sensors send them.
     pub fn new(payload: &[u8]) -> Result<Self, DatagramError> {
         if payload.len() != TELEMETRY_LENGTH {
             return Err(DatagramError::Length { length: payload.len() });

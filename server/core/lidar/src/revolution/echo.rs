@@ -55,7 +55,7 @@ impl Echo {
         }
     }
 
-    /// True if the last echo of a slot was equal to this one. Its range was removed then, but not its coordinates.
+    /// True if the last echo of a slot was equal to this echo. Its range was removed then, but not its coordinates.
     pub(super) fn is_repeated_by(&self, last: &Echo, slot: usize) -> bool {
         let position = |echo: &Echo| [echo.x[slot], echo.y[slot], echo.z[slot]];
         last.range_m[slot] == 0.0 && position(self) == position(last)

@@ -38,7 +38,7 @@ pub struct Revolution {
     pub lasers: usize,
     /// Firings, in time order.
     pub firings: Vec<Firing>,
-    /// One range image, or two in dual-return mode: that of the strongest echo, then that of the last. A last echo that
+    /// One range image, or two in dual-return mode: the strongest echo's image, then the last echo's. A last echo that
     /// equals the strongest has range 0 in the second image, so that each return occurs once.
     pub echoes: Vec<Echo>,
     /// Per-laser corrections that were applied; `calibration.lasers[laser]` has the elevation.
@@ -60,8 +60,8 @@ pub struct Revolution {
     pub partial: Option<Partial>,
     /// Number of data packets with firings in this revolution.
     pub packets: u32,
-    /// Number of data packets that the revolution should have: `packets` and those that were missing, ±1 per gap. From
-    /// the second revolution on, packets of a field-of-view gap are not counted. A gap over the cut is counted in the
+    /// Number of data packets that the revolution should have: `packets` and the missing packets, ±1 per gap. From the
+    /// second revolution on, packets of a field-of-view gap are not counted. A gap over the cut is counted in the
     /// revolution in which it begins.
     pub packets_expected: u32,
     /// Encoder angles, as [`Firing::azimuth_rad`], between which the sensor does not fire because a field of view is
@@ -70,8 +70,8 @@ pub struct Revolution {
     pub fov_gap_rad: Option<[f32; 2]>,
     /// Sectors and lasers from which returns have ceased.
     pub blocked: Blocked,
-    /// Number of firings of a complete revolution: that of this one if it is complete, else of the newest complete one,
-    /// else from the period in the manual. The number of received firings is `firings.len()`.
+    /// Number of firings of a complete revolution: counted in this revolution if it is complete, else in the newest
+    /// complete revolution, else by the period in the manual. The number of received firings is `firings.len()`.
     pub firings_expected: u32,
 }
 

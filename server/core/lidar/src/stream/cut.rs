@@ -51,8 +51,8 @@ const JITTER: u32 = 20;
 /// counts, which jitter and the rounding of azimuths to whole counts can reach.
 const GAP_SLACK: u32 = 8;
 
-/// The longest step, in counts, between two firings of which `expected` is the usual step. The loss of a packet with a
-/// single firing doubles the step; the jitter of an encoder stays below half a step.
+/// The longest step, in counts, between two firings with the usual step `expected`. The loss of a packet with a single
+/// firing doubles the step; the jitter of an encoder stays below half a step.
 fn step_max(expected: u32) -> u32 {
     expected + expected / 2
 }
@@ -131,7 +131,7 @@ impl Cutter {
         self.last.is_some_and(|last| (1..=step_max(expected)).contains(&forward(last, self.cut)))
     }
 
-    /// Forgets the azimuth.
+    /// Forgets the newest azimuth and the counts travelled, as before the first firing.
     pub fn reset(&mut self) {
         (self.last, self.travelled) = (None, 0);
     }

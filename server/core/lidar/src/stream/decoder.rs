@@ -238,9 +238,9 @@ impl Decoder {
         self.status.device_time_stands
     }
 
-    /// Counts from the packet before to this one: the step of a sensor whose packets have a single firing (VLS-128 in
-    /// dual-return mode). It is the nominal step if the measured one differs by more than half of it: then a packet was
-    /// lost, or the rate of rotation is not known yet.
+    /// Counts from the packet before to this packet: the step of a sensor whose packets have a single firing (VLS-128
+    /// in dual-return mode). It is the nominal step if the measured step differs by more than half of it: then a packet
+    /// was lost, or the rate of rotation is not known yet.
     fn step_between_packets(&mut self, packet: &Packet<'_>) -> Option<u32> {
         let azimuth = packet.azimuth(0);
         let before = self.packet_azimuth.replace(azimuth);
@@ -250,7 +250,7 @@ impl Decoder {
         Some(measured.filter(|step| possible.contains(step)).unwrap_or(nominal))
     }
 
-    /// Number of packets from the one that began at azimuth `before` to this one, from the angle between them.
+    /// Number of packets from the packet that began at azimuth `before` to this packet, by the angle between them.
     fn packets_since(&self, before: Option<u32>, packet: &Packet<'_>) -> i64 {
         let turned = before.map_or(0, |before| forward(before, packet.azimuth(0)));
         let by_rate =

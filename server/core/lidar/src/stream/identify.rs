@@ -8,8 +8,8 @@ use crate::datagram::DatagramError;
 use crate::datagram::packet::Packet;
 use crate::model::{BLOCKS_PER_PACKET, FLAG_LASERS_0, FLAG_LASERS_64, FLAG_LASERS_96, Model, ReturnMode};
 
-/// Number of packets that wait while their rate may decide between two models. After them the model is that of the
-/// byte. Ours: at 1,327 µs a packet they are 21 ms, less than a revolution.
+/// Number of packets that wait while their rate may decide between two models. After them the model byte decides. Ours:
+/// at 1,327 µs a packet they are 21 ms, less than a revolution.
 pub(crate) const PACKETS_WAITING_MAX: usize = 16;
 
 /// Model byte of an HDL-32E and of a VLP-16 of 2014.
@@ -113,7 +113,7 @@ fn find_by_byte(byte: u8) -> Result<Model, DatagramError> {
     })
 }
 
-/// True if upper and lower blocks alternate and each pair has one azimuth, as those of an HDL-64E S2 or S3.
+/// True if upper and lower blocks alternate and each pair has one azimuth, as in packets of an HDL-64E S2 or S3.
 fn blocks_come_in_pairs(packet: &Packet<'_>) -> bool {
     (0..BLOCKS_PER_PACKET).step_by(2).all(|block| {
         packet.flag(block) == FLAG_LASERS_0

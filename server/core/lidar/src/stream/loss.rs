@@ -9,7 +9,7 @@ use super::order::Gap;
 use crate::model::AZIMUTHS_PER_REVOLUTION;
 
 /// Least length of a field-of-view gap, in counts: 15 degrees. Ours: three packets of a VLP-16, the sensor with the
-/// longest ones; a shorter gap is loss.
+/// longest packets; a shorter gap is loss.
 const FOV_GAP_MIN: u32 = 1_500;
 /// Number of packets by which the ends of a field-of-view gap may differ between revolutions: the gap ends between two
 /// packets, so each end moves by one packet, and a loss beside it moves the end by another.
@@ -30,7 +30,7 @@ pub(super) struct Loss {
     lost: u64,
     /// A long gap that is loss unless the next revolution repeats it.
     candidate: Option<EmptySector>,
-    /// The field-of-view gap.
+    /// The sector in which the sensor sends no packets in any revolution, if it has one.
     fov_gap: Option<EmptySector>,
     /// Azimuth at which the packet before ended.
     before: Option<u32>,
@@ -102,7 +102,7 @@ impl Loss {
         self.fov_gap.is_some_and(|sector| sector.is_about(&step, FOV_GAP_ERROR_PACKETS * span))
     }
 
-    /// Number of packets that were lost so far, without those of a candidate.
+    /// Number of packets lost so far, without the packets of a candidate gap.
     pub fn lost(&self) -> u64 {
         self.lost
     }
@@ -124,7 +124,7 @@ impl EmptySector {
         forward(self.from, self.to)
     }
 
-    /// True if both ends are those of `other`, ± `reach` counts.
+    /// True if both ends equal the ends of `other`, ± `reach` counts.
     fn is_about(&self, other: &EmptySector, reach: u32) -> bool {
         is_near(self.from, other.from, reach) && is_near(self.to, other.to, reach)
     }

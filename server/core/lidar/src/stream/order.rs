@@ -77,7 +77,7 @@ struct PacketKey {
     /// Counts of a field-of-view gap inside this packet.
     fov_gap: u32,
     period_ns: i64,
-    /// Packet periods until the next packet: one, and those of a field-of-view gap.
+    /// Packet periods until the next packet: one, plus the periods of a field-of-view gap.
     length: i64,
     /// Checksum of the bytes if the sensor sends no time, else 0.
     checksum: u64,
@@ -107,7 +107,7 @@ struct Newest {
 pub(crate) struct Order {
     /// Waiting packets, by position.
     waiting: VecDeque<Waiting>,
-    /// Memory of packets that no longer wait, for the next ones.
+    /// Memory of packets that no longer wait, for the next packets.
     spare: Vec<Waiting>,
     newest: Option<Newest>,
     /// Position and length of the last packet that passed.

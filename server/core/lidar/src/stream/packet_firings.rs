@@ -6,7 +6,7 @@ use super::azimuth::forward;
 use crate::datagram::packet::Packet;
 use crate::model::{AZIMUTHS_PER_REVOLUTION, BLOCKS_PER_PACKET, ModelSpec, ReturnMode};
 
-/// Greatest number of firings of a packet: that of a VLP-16.
+/// Greatest number of firings of a packet, reached by a VLP-16.
 pub(super) const MAX_FIRINGS: usize = 2 * BLOCKS_PER_PACKET;
 
 /// The azimuths of the firings of a packet.

@@ -38,8 +38,8 @@ impl StatusBytes {
         }
     }
 
-    /// Adds a packet of an HDL-64E, and returns telemetry if its status completes it. `model` and `calibration` are
-    /// those in use.
+    /// Adds a packet of an HDL-64E, and returns telemetry if its status completes it. `model` and `calibration` are the
+    /// present model and table.
     pub fn push(
         &mut self,
         packet: &Packet<'_>,

@@ -12,8 +12,8 @@
 //!
 //! | condition when a revolution ends | state | offset |
 //! |---|---|---|
-//! | A GPRMC is within reach, at most 3 s old, and the pulse is locked. | `gps` | that of the GPRMC |
-//! | A GPRMC is within reach. | `gps_unlocked` | that of the GPRMC |
+//! | A GPRMC is within reach, at most 3 s old, and the pulse is locked. | `gps` | from the GPRMC |
+//! | A GPRMC is within reach. | `gps_unlocked` | from the GPRMC |
 //! | Arrival is within reach, and agrees with the device's minutes to 250 ms. | `device` | whole hours |
 //! | Arrival is within reach. | `arrival` | the least delay of a revolution |
 //! | None of these, or arrival must not be followed yet. | `holdover` | unchanged |
@@ -24,7 +24,7 @@
 //! - behind by at most [`crate::SensorConfig::ahead_ns_max`], the stamps run at half speed until they are right;
 //! - behind by more, they go back to that clock at once: a new *epoch* begins, and the revolution states its number.
 //!
-//! Within an epoch stamps always rise. A second of the timeline passes from the beginning of one to that of the next.
+//! Within an epoch stamps always rise. Epochs begin at least a second of the timeline apart.
 //!
 //! # Transitions
 //!
@@ -48,8 +48,8 @@
 //! # Why
 //!
 //! - A GPRMC counts as valid if the receiver reports a valid fix, the device's minutes and seconds agree with it, and
-//!   it is at most [`crate::SensorConfig::gps_late_ns_max`] older than its arrival. An older one is that of an old
-//!   capture, or of a receiver that has lost count of its weeks; arrival then gives the time, as for the planner. A
+//!   it is at most [`crate::SensorConfig::gps_late_ns_max`] older than its arrival. An older GPRMC comes from an old
+//!   capture, or from a receiver that has lost count of its weeks; arrival then gives the time, as for the planner. A
 //!   GPRMC that is later than its arrival by less than that, less six hours, is valid: no packet arrives before it is
 //!   sent, so the host's clock is wrong. A GPRMC that is later by more has a wrong date, unless the host's clock was
 //!   never set: it then shows a time before the first of these sensors.
@@ -112,7 +112,7 @@ pub enum Clock {
     /// (of an HDL-64E S1: the nominal packet rate).
     #[default]
     Arrival,
-    /// The device's minutes and seconds, which agree with those of the host; the hour is the host's.
+    /// The device's minutes and seconds, which agree with the host's clock; the hour is the host's.
     Device,
     /// GPS: telemetry gives date and hour, and the pulse is locked (an HDL-32E does not report whether it is).
     Gps,
@@ -194,7 +194,7 @@ struct PendingGps {
 }
 
 impl DeviceClock {
-    /// The clock of a sensor before its first datagram. The arguments are those of [`crate::SensorConfig`].
+    /// The clock of a sensor before its first datagram. The arguments are defined by [`crate::SensorConfig`].
     pub fn new(gps_late_ns_max: i64, ahead_ns_max: i64) -> Self {
         Self { gps_late_ns_max, ahead_ns_max, ..Self::default() }
     }
@@ -279,7 +279,7 @@ impl DeviceClock {
         stamp
     }
 
-    /// Begins an epoch if the right stamp of a revolution is so far behind the newest one that stamps go back to it.
+    /// Begins an epoch if the right stamp of a revolution is so far behind the newest stamp that stamps go back to it.
     fn begin_epoch_if_ahead(&mut self, first_ns: i64, right_ns: i64) -> bool {
         let is_ahead = self.newest.is_some_and(|newest| newest.end_ns - right_ns > self.ahead_ns_max);
         let begins = self.ahead_ns_max > 0 && is_ahead && self.may_begin_epoch(first_ns);
@@ -289,7 +289,7 @@ impl DeviceClock {
         begins
     }
 
-    /// True if the newest epoch is old enough for another one to begin at `first_ns` on the timeline.
+    /// True if the newest epoch is old enough for another epoch to begin at `first_ns` on the timeline.
     fn may_begin_epoch(&self, first_ns: i64) -> bool {
         self.epoch_began_ns.is_none_or(|began_ns| first_ns - began_ns >= EPOCH_NS_MIN)
     }
@@ -351,7 +351,7 @@ impl DeviceClock {
         (later_ns >= -STEP_NS_MAX).then_some((offset_ns, clock))
     }
 
-    /// The offset of whole hours if it is near the offset by arrival, else the latter.
+    /// The offset of whole hours if it is near the offset by arrival, else the offset by arrival.
     fn offset_by_arrival(&mut self, arrival_offset_ns: i64) -> (i64, Clock) {
         self.minimum_delay.restart_window();
         match self.timeline.zero_by_hour_ns(arrival_offset_ns) {

@@ -4,8 +4,8 @@ use super::timeline::{NS_PER_HOUR, NS_PER_SECOND, nearest_hour};
 use crate::datagram::telemetry::Telemetry;
 
 /// Age of a GPRMC on the device's clock, in ns. A GPRMC names the second that has passed and is repeated until the next
-/// one: it is 0.85 to 1.85 s old in the recorded drives of an HDL-32E and 1.1 to 1.5 s in those of a VLP-16. A device
-/// whose time differs by more was not set by this receiver.
+/// one: it is 0.85 to 1.85 s old in the recorded drives of an HDL-32E and 1.1 to 1.5 s in the drives of a VLP-16. A
+/// device whose time differs by more was not set by this receiver.
 const GPRMC_AGE_NS: std::ops::RangeInclusive<i64> = -500_000_000..=2_900_000_000;
 /// Time without telemetry, in ns, after which GPS is lost. Sensors send telemetry many times per second.
 const GPS_SILENCE_NS_MAX: i64 = 3 * NS_PER_SECOND;

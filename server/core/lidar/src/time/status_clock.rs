@@ -37,7 +37,7 @@ impl StatusClock {
         let pps = match gps {
             b'A' => Pps::Locked,
             b'V' => Pps::Absent,
-            // With `P` or 0 the date is that of the sensor's own clock, which counts from 2000.
+            // With `P` or 0 the date comes from the sensor's own clock, which counts from 2000.
             _ => return None,
         };
         let utc_ns = unix_ns([year, month, day].map(i64::from), [hour, minute, second].map(i64::from))?;

@@ -38,12 +38,12 @@ const US_MAX: u32 = 3_601_000_000;
 /// was sent before or after a jump.
 const TELEMETRY_NS_MAX: i64 = NS_PER_SECOND;
 
-/// How the time of a packet follows from that of the packet before.
+/// How the time of a packet follows from the time of the packet before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum StepKind {
     /// The packet is the first one.
     First,
-    /// The step is that of the device's counter, or a packet period while a jump is not confirmed.
+    /// The step comes from the device's counter, or is a packet period while a jump is not confirmed.
     Continuous,
     /// The device's counter jumped (or the sensor was silent and sends no time): the step follows from arrivals.
     Jumped,
@@ -156,8 +156,8 @@ impl Timeline {
         (device_us < US_MAX && ahead_ns.abs() <= TELEMETRY_NS_MAX).then_some(last.time_ns + ahead_ns)
     }
 
-    /// Unix time of the timeline's zero if the device's minutes and seconds are those of UTC: of all hours the one that
-    /// is nearest to `zero_ns`. `None` if the sensor sends no time.
+    /// Unix time of the timeline's zero if the device's minutes and seconds are UTC, with the hour that is nearest to
+    /// `zero_ns`. `None` if the sensor sends no time.
     pub fn zero_by_hour_ns(&self, zero_ns: i64) -> Option<i64> {
         let last = self.last?;
         Some(nearest_hour(last.past_hour_ns? - last.time_ns, zero_ns))

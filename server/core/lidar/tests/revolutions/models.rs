@@ -142,7 +142,7 @@ fn sixteen_packets_from_other_times_do_not_delay_the_stream() {
 #[test]
 fn the_model_byte_decides_if_no_rate_confirms_it() {
     let stream = Stream::of(Model::Hdl32e);
-    // Every third packet arrives: a period of 1,659 µs is that of neither model.
+    // Every third packet arrives: a period of 1,659 µs fits neither model.
     let mut sensor = Sensor::new(SensorConfig::default());
     stream.push(&mut sensor, (0..60).step_by(3));
     assert_eq!(sensor.status().model, Some(Model::Hdl32e));

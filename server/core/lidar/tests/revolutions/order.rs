@@ -9,7 +9,7 @@ fn sensor(model: Model) -> Sensor {
     Sensor::new(SensorConfig { model: Some(model), ..SensorConfig::default() })
 }
 
-/// Decodes packets of which none is refused, and returns the revolutions and the status at the end.
+/// Decodes packets, asserts that none is refused, and returns the revolutions and the status at the end.
 fn decode(model: Model, packets: &[(Vec<u8>, i64)]) -> (Vec<Revolution>, SensorStatus) {
     let mut sensor = sensor(model);
     let push = |(packet, arrival_ns): &(Vec<u8>, i64)| sensor.push(packet, *arrival_ns).unwrap().cloned();

@@ -63,8 +63,9 @@ pub fn spread(name: &str, mut errors: Vec<f32>) -> (f32, f32) {
     (median, greatest)
 }
 
-/// Compares our points with those of a reference. These must be a run of our points without a gap, with the same rings,
-/// intensities and return types. Returns the distances between points, in m, and the index at which the run begins.
+/// Compares our points with the points of a reference, which must be a run of our points without a gap, with the same
+/// rings, intensities and return types. Returns the distances between points, in m, and the index at which the run
+/// begins.
 pub fn against(points: &[Point], expected: &[archive::Reference]) -> (Vec<f32>, usize) {
     let same = |point: &Point, expected: &archive::Reference| {
         (point.ring, f32::from(point.intensity), point.return_type)

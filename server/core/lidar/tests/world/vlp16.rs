@@ -80,7 +80,7 @@ fn revolutions_between_the_first_and_the_last_are_complete() {
         assert!(first_azimuth_deg(revolution) >= 180.0 && first_azimuth_deg(revolution) < 180.25);
     }
     assert!(revolutions.windows(2).all(|pair| pair[0].end_ns < pair[1].start_ns));
-    // The GPRMC is that of 21:41:06 on 23 July 2015.
+    // The GPRMC states 21:41:06 on 23 July 2015.
     assert_eq!(sensor.status().gprmc.unwrap().utc_ns, Some(1_437_687_666_000_000_000));
     // The device time of the first packet is 2,467,108,343 µs past 21 h. The pulse is locked, and the clock of the
     // recording host was 1.4 s behind.

@@ -17,7 +17,7 @@ pub struct AlignedGrid {
     pub origin_m: [f64; 2],
     /// Cells along the frame's x axis.
     pub width: u32,
-    /// Cells along its y axis.
+    /// Number of cells along the grid's y axis.
     pub height: u32,
     /// Row by row, x first: 0 free to 100 occupied, -1 unknown.
     pub occupancies: Vec<i8>,

@@ -18,7 +18,7 @@ pub fn base_frame(vehicle: &str) -> String {
 pub struct FrameNames {
     /// The frame of the poses, which is fixed to the ground.
     pub fixed: String,
-    /// The ego frame.
+    /// The vehicle's own frame, with its origin on the ground.
     pub ego: String,
 }
 

@@ -3,8 +3,8 @@
 //! In: a layer, Cartesian or radial. Out: row by row, x first, an occupancy (0 free to 100 occupied, -1 unknown) or
 //! red, green, blue and alpha for each cell; and the position of the cells in the ego frame. A Cartesian layer keeps
 //! its cells and its axes. A radial layer is resampled: a square cell gets the worst of the radial cell at its middle
-//! and those whose middles lie in it, so that near the vehicle, where radial cells are smaller, no obstacle is lost.
-//! Unknown is worse than free.
+//! and the radial cells whose middles lie in it, so that near the vehicle, where radial cells are smaller, no obstacle
+//! is lost. Unknown is worse than free.
 //!
 //! | occupancy | meaning of the class |
 //! |---|---|
@@ -24,7 +24,7 @@ use nalgebra::{Isometry3, Vector3};
 
 use crate::encode::colours::Colours;
 
-/// Edge of the cells to which radial layers are resampled, in metres: that of the other layers.
+/// Edge of the cells to which radial layers are resampled, in metres, equal to the cells of the other layers.
 const CELL_M: f64 = 0.25;
 /// Most square cells from the vehicle to the edge; larger grids get larger cells.
 const CELLS_MAX: f64 = 1000.0;
@@ -44,7 +44,7 @@ pub struct Raster {
     grid: Grid,
     /// Cells along the raster's x axis.
     pub width: u32,
-    /// Cells along its y axis.
+    /// Number of cells along the raster's y axis.
     pub height: u32,
     /// Edge of a cell, in metres.
     pub cell_m: f32,
@@ -104,7 +104,7 @@ impl Raster {
         }
     }
 
-    /// Number of its cells.
+    /// Number of cells of the raster.
     pub fn cells(&self) -> usize {
         self.width as usize * self.height as usize
     }

@@ -30,13 +30,13 @@ const NARROW: f64 = 50.0;
 
 /// A layer of a map, as its topics show it.
 pub struct ShownLayer<'a> {
-    /// The map.
+    /// The map that has the layer.
     pub map: &'a MapView,
-    /// Its layer.
+    /// The layer to show.
     pub layer: &'a Layer,
     /// The raster of the layer.
     pub raster: &'a Raster,
-    /// The vehicle's frames.
+    /// Names of the frames in the messages.
     pub frames: &'a FrameNames,
     /// True until the map is stale.
     pub is_fresh: bool,
@@ -46,7 +46,7 @@ pub struct ShownLayer<'a> {
 pub struct LayerTopic {
     /// End of the topic's name, behind the layer's.
     pub ending: &'static str,
-    /// Type of its messages.
+    /// Message type of the topic.
     pub kind: Published,
     /// True if a later subscriber gets the newest message.
     pub is_latched: bool,

@@ -12,7 +12,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 pub const LAYER: &str = "safe_path";
 /// Width of the links' lines in metres.
 pub const LINK_M: f64 = 0.15;
-/// Red, green, blue and opacity of the links' lines: those of the page.
+/// Red, green, blue and opacity of the links' lines, as on the page.
 pub const LINK_RGBA: [f32; 4] = [1.0, 0.88, 0.3, 1.0];
 /// Width of the circles' lines in metres.
 pub const CIRCLE_M: f64 = 0.05;
@@ -20,7 +20,7 @@ pub const CIRCLE_M: f64 = 0.05;
 pub const CIRCLE_RGBA: [f32; 4] = [1.0, 1.0, 1.0, 0.5];
 /// Height of lines and poses over the ground in metres, so that they are not in the plane of the grids.
 const LIFT_M: f64 = 0.05;
-/// Every so many points a circle is drawn, beside those at ends and branches. Ours: 2 m apart with cells of 0.25 m.
+/// A circle is drawn every so many points, and at ends and branches. Ours: 2 m apart with cells of 0.25 m.
 const CIRCLE_EVERY: usize = 8;
 /// Straight lines of a circle.
 const SIDES: u32 = 32;

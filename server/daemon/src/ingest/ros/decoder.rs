@@ -45,9 +45,9 @@ pub enum RosMessageError {
     /// The topic's role does not allow this type.
     #[error("a {kind}: allowed: {allowed}")]
     Kind {
-        /// The message's type.
+        /// Type of the refused message.
         kind: Kind,
-        /// The allowed types.
+        /// The types that the topic's role allows, in words.
         allowed: &'static str,
     },
     /// A cloud is in another frame than the first clouds of its topic.
@@ -69,9 +69,9 @@ pub enum RosMessageError {
     /// No chain of transforms joins the message's frame and the vehicle's.
     #[error("frame {frame}: no chain of transforms joins it to {ego_frame}")]
     Frame {
-        /// The message's frame.
+        /// Frame that the message names.
         frame: String,
-        /// The vehicle's frame.
+        /// Name of the vehicle's frame.
         ego_frame: String,
     },
 }
@@ -144,8 +144,8 @@ impl TopicDecoder {
         Self { cloud_frames, ..self }
     }
 
-    /// The decoder, which refuses poses of the topic of poses in another frame than this one; empty: any frame. Grids
-    /// are published in this frame, and poses of two frames would jump.
+    /// The decoder, which refuses poses of the topic of poses in another frame than `fixed_frame`; empty: any frame.
+    /// Grids are published in this frame, and poses of two frames would jump.
     pub fn posed_in(self, fixed_frame: &str) -> Self {
         Self { fixed_frame: fixed_frame.to_owned(), ..self }
     }
@@ -243,7 +243,7 @@ impl TopicDecoder {
         Err(RosMessageError::OtherFixedFrame { fixed_frame, found })
     }
 
-    /// An odometry without a child frame is that of the vehicle.
+    /// An odometry without a child frame describes the vehicle.
     fn pose_of_odometry(&mut self, odometry: &Odometry) -> Result<Option<EgoPose>, RosMessageError> {
         let StampedTransform { header, child_frame_id, parent_from_child } = &odometry.transform;
         self.check_fixed_frame(header.frame_id)?;
@@ -255,14 +255,14 @@ impl TopicDecoder {
         let Some(Twist { linear_mps, angular_rps }) = odometry.twist else {
             return Ok(self.pose_with_speed(header.stamp_ns, map_from_ego));
         };
-        // The twist is that of the child frame; while it rotates, a point at a distance from it moves as well.
+        // The twist describes the child frame; while it rotates, a point at a distance from it moves as well.
         let from_rotation = Vector3::from(angular_rps).cross(&child_from_ego.translation.vector);
         let velocity = child_from_ego.rotation.inverse() * (Vector3::from(linear_mps) + from_rotation);
         Ok(Some(EgoPose { stamp_ns: header.stamp_ns, map_from_ego, speed_mps: velocity.x }))
     }
 
     /// The ego pose with its speed, computed from the forward distance since the pose before. `None` for the first
-    /// pose, for a repeated stamp, and if the stamps step back: the poses after the step are computed from this one,
+    /// pose, for a repeated stamp, and if the stamps step back: the poses after the step are computed from this pose,
     /// and the pipeline decides whether an epoch has begun.
     fn pose_with_speed(&mut self, stamp_ns: i64, map_from_ego: Isometry3<f64>) -> Option<EgoPose> {
         if self.newest.is_some_and(|(before_ns, _)| before_ns == stamp_ns) {
@@ -276,7 +276,7 @@ impl TopicDecoder {
     }
 
     /// Inserts transforms into the tf tree. Returns the vehicle's pose if they move it. The nearest moving transform
-    /// above the vehicle's frame gives the stamp, because transforms farther up (those of a localisation) are rare, and
+    /// above the vehicle's frame gives the stamp, because transforms farther up (from a localisation) are rare, and
     /// some programs stamp them in advance.
     fn insert_transforms(
         &mut self,

@@ -150,7 +150,7 @@ impl SampleReceiver {
         self.queue.drops().record_refused_messages(self.decoder.source(topic), reason, 1);
     }
 
-    /// Number of messages of the same publisher that were lost before this one.
+    /// Number of messages of the same publisher that were lost before this message.
     fn lost_before(&mut self, sequence: i64, publisher: [u8; 16]) -> u64 {
         if self.sequences.len() >= PUBLISHERS_MAX && !self.sequences.contains_key(&publisher) {
             return 0;

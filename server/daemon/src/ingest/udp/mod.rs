@@ -43,9 +43,9 @@ pub struct Sockets(Vec<(Socket, SocketAddr, Listener)>);
 pub struct BindError {
     /// Index of the first vehicle that is configured with the socket.
     pub vehicle: usize,
-    /// The configured address.
+    /// The address in the configuration.
     pub at: SocketAddr,
-    /// The system's reason.
+    /// Error of the operating system.
     pub source: io::Error,
 }
 

@@ -41,7 +41,7 @@ sockopt_impl!(
 /// Index of the socket's drop counter in [`MemoryInfo`].
 const SK_MEMINFO_DROPS: usize = 8;
 
-/// One datagram.
+/// A datagram with its sender and the kernel's stamp.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Received {
     /// The sender's address; an IPv4 address also if an IPv6 socket received it. `None` if the kernel gives none.
@@ -75,7 +75,7 @@ impl Receiver {
         Ok(Self { socket, slab: BytesMut::new(), drops: 0 })
     }
 
-    /// The socket.
+    /// The socket from which datagrams are read.
     pub fn socket(&self) -> &Socket {
         &self.socket
     }

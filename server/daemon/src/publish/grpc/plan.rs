@@ -9,7 +9,7 @@ use crate::engine::plans::PlanRefused;
 use crate::publish::listen::access::caller;
 use crate::publish::served::Vehicles;
 
-/// The service.
+/// `clearway.v1.PlanService`, which takes plans of planners.
 pub(super) struct Planners {
     vehicles: Vehicles,
 }

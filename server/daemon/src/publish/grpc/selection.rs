@@ -17,7 +17,7 @@ use clearway_journal::encode::EncodedMap;
 /// Greatest `max_in_flight`. Ours: more maps on the way would only be older ones.
 const IN_FLIGHT_MAX: u32 = 64;
 
-/// A checked selection.
+/// A reader's selection of maps, checked against the vehicle.
 #[derive(Clone, Debug)]
 pub struct Selection {
     /// The layers to send; all if empty.
@@ -105,7 +105,7 @@ impl Rate {
         self.period_ns == 0 || self.due_ns.is_none_or(|due_ns| stamp_ns >= due_ns)
     }
 
-    /// Records that a map captured at `stamp_ns` was sent. The next map is due one period after this one was due,
+    /// Records that a map captured at `stamp_ns` was sent. The next map is due one period after this map was due,
     /// however late it came, so that the mean rate is kept even if the map rate is no multiple of it; a reader that was
     /// away does not catch up. The quarter of a period allows for jitter of the maps.
     pub fn send(&mut self, stamp_ns: i64) {
@@ -122,7 +122,7 @@ impl Rate {
         };
     }
 
-    /// How many of `between` maps, captured between two sent ones, the rate would have allowed.
+    /// How many of `between` maps, captured between two sent maps, the rate would have allowed.
     fn room(&self, between: u64, sent_ns: [i64; 2]) -> u64 {
         if self.period_ns == 0 {
             return between;
@@ -131,7 +131,7 @@ impl Rate {
         between.min(u64::try_from(periods - 1).unwrap_or(0))
     }
 
-    /// Maps between two sent ones: (missed, left out because of the rate).
+    /// Maps between two sent maps: (missed, left out because of the rate).
     pub fn between(&self, last: Sent, next: Sent) -> (u64, u64) {
         if last.boot_id != next.boot_id {
             // A jump of a replay, which leaves nothing out.
@@ -268,7 +268,7 @@ mod tests {
         assert!(credits.left() && credits.in_flight.is_empty());
     }
 
-    /// Stamps of the maps that are sent, of those made at `stamps`.
+    /// Stamps of the sent maps, if maps are made at `stamps`.
     fn selected(hz: f64, stamps: impl IntoIterator<Item = i64>) -> Vec<i64> {
         let mut rate = Rate::new(Some(hz)).unwrap();
         let due = |stamp: &i64| {
@@ -301,7 +301,7 @@ mod tests {
     #[test]
     fn maps_left_out_by_the_rate_are_counted_apart_from_missed_ones() {
         let rate = Rate::new(Some(5.0)).unwrap();
-        // Away for 2 s of 10 Hz maps: 19 in between, for 9 of which 5 Hz had room.
+        // Away for 2 s of 10 Hz maps: 19 maps in between; 5 Hz had room for 9 of them.
         assert_eq!(rate.room(19, [0, 2000 * MS]), 9);
         assert_eq!(Rate::new(None).unwrap().room(19, [0, 2000 * MS]), 19);
         assert_eq!(rate.room(2, [0, 2000 * MS]), 2, "no more than there were");

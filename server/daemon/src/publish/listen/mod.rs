@@ -6,7 +6,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | `slots` | peers -> connections and calls within the limits, in all and of one address; idle ones closed |
+//! | `slots` | peers -> connections and calls within the limits, in all and of one address; idle connections closed |
 //! | `tls` | certificates -> TLS, names of clients |
 //! | [`access`] | names -> roles -> RPCs and paths, vehicles and layers |
 //! | [`security`] | certificates, roles and tokens that hold at present |
@@ -85,13 +85,13 @@ const RESETS_FOR_MISTAKES_MAX: usize = 128;
 /// Interval and timeout of HTTP/2 keepalive: a client that has disappeared is noticed after both.
 const KEEPALIVE: Duration = Duration::from_secs(10);
 
-/// What a listener speaks.
+/// The protocol of a listener.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Protocol {
     /// HTTP/2 with gRPC: refusals are a gRPC status.
     Grpc,
     /// HTTP/1 for browsers and programs: refusals are a status and a text. Pages of these origins may connect, beside
-    /// the server's own and those of the configuration.
+    /// the server's own pages and the configured origins.
     Web(&'static [&'static str]),
 }
 
@@ -163,7 +163,7 @@ impl Listener {
         (Self { socket, shared: shared.clone(), all: all.clone() }, ListenerHandle(shared))
     }
 
-    /// The address it listens on.
+    /// The address on which the listener accepts; `None` if it has none.
     pub fn address(&self) -> Option<SocketAddr> {
         self.socket.local_addr().ok()
     }

@@ -76,7 +76,7 @@ impl Security {
         self.0.read().unwrap_or_else(std::sync::PoisonError::into_inner).clone()
     }
 
-    /// From now on `current` holds for new connections and new requests; open ones stay.
+    /// From now on `current` holds for new connections and new requests; open connections stay.
     pub fn replace(&self, current: Current) {
         *self.0.write().unwrap_or_else(std::sync::PoisonError::into_inner) = Arc::new(current);
     }

@@ -63,7 +63,7 @@ pub struct Authorization {
     pub path: String,
     /// The names in the certificate and of the token.
     pub names: Vec<String>,
-    /// What the client may reach.
+    /// The client, with the vehicles and layers that it may reach.
     pub caller: Caller,
 }
 
@@ -201,7 +201,7 @@ impl ConnectionSlots {
         locked(&self.0).close(|connection| (!connection.calls.values().all(&is_allowed)).then_some("role_lost"));
     }
 
-    /// Closes up to `most` connections without a call, idle ones first, to free file handles; returns how many.
+    /// Closes up to `most` connections without a call, idle connections first, to free file handles; returns how many.
     pub fn free(&self, most: usize) -> usize {
         let mut slots = locked(&self.0);
         (0..most).take_while(|_| slots.close_idlest(|_| true)).count()
@@ -268,7 +268,7 @@ impl ConnectionSlot {
         self.slots.count(reason);
     }
 
-    /// Closes the connection.
+    /// Logs and counts the end of the connection under `reason`, and closes it.
     pub fn close(&self, reason: &'static str) {
         tracing::info!(peer = %self.peer, reason, "connection closed");
         self.count(reason);
@@ -302,7 +302,7 @@ impl ConnectionSlot {
         Ok(())
     }
 
-    /// Begins a call; `None` if too many calls of all peers or of this one's address are in progress.
+    /// Begins a call; `None` if too many calls of all peers or of this peer's address are in progress.
     pub fn begin_call(self: &Arc<Self>, authorization: Authorization) -> Option<CallPermit> {
         let (mut slots, address) = (locked(&self.slots.0), self.address());
         let calls = |of: &dyn Fn(&OpenConnection) -> bool| -> usize {

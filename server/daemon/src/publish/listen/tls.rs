@@ -22,7 +22,7 @@ pub struct Tls {
     pub web: TlsAcceptor,
     /// The names in the server's certificate.
     pub names: Vec<String>,
-    /// When the server's certificates and those of the CA end, by their keys in the configuration, in seconds since the
+    /// When the certificates of the server and of the CA end, by their keys in the configuration, in seconds since the
     /// Unix epoch.
     pub ends_s: Vec<(&'static str, i64)>,
 }

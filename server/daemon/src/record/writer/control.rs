@@ -11,12 +11,12 @@ use super::counts::RecorderCounts;
 use super::folder::Folder;
 use crate::config::Recorder as Options;
 
-/// A request.
+/// A request of an operator to the recorder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// Records again.
+    /// Records again after [`Command::Stop`].
     Start,
-    /// Closes the file.
+    /// Closes the file; nothing is recorded until [`Command::Start`].
     Stop,
     /// Begins the next part.
     Split,
@@ -24,7 +24,7 @@ pub enum Command {
     Save {
         /// Number of seconds.
         seconds: u64,
-        /// Why they are kept.
+        /// Why the seconds are kept; a part of the folder's name.
         reason: String,
     },
 }
@@ -44,7 +44,7 @@ pub enum ControlError {
     /// The reason of a save is not allowed.
     #[error("reason = {0:?}: 1 to 40 letters, digits and `-` are allowed")]
     Reason(String),
-    /// The recorder cannot do it now.
+    /// The recorder cannot follow the request now: the reason.
     #[error("{0}")]
     Refused(String),
     /// The recorder has ended or hangs.

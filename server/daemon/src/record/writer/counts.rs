@@ -16,7 +16,7 @@ use clearway_journal::mcap_file::topic_of_layer;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the recording is incomplete: {reason}")]
 pub struct IncompleteRecordingError {
-    /// The failure that made it incomplete.
+    /// The first failure, which made the recording incomplete.
     pub reason: String,
 }
 

@@ -1,4 +1,4 @@
-//! The files of a recording: their names, how they become visible, and which old ones are deleted.
+//! The files of a recording: their names, how they become visible, and which old files are deleted.
 //!
 //! The parts of `drive.mcap` are `drive.mcap`, `drive.part-0002.mcap`, `drive.part-0003.mcap`, ... A part is written as
 //! `drive.unfinished.mcap` or `drive.part-0002.unfinished.mcap`, and gets its name when it is closed and on the disk.
@@ -28,22 +28,22 @@ pub enum RecordError {
     /// The file or the recorder's thread cannot be created.
     #[error("recording {}: {source}", file.display())]
     Create {
-        /// The recording.
+        /// Path of the recording.
         file: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// The header cannot be written.
     #[error("recording {}: {}", file.display(), with_cause(source))]
     Write {
-        /// The recording.
+        /// Path of the recording.
         file: PathBuf,
-        /// The reason.
+        /// Error of the MCAP writer.
         source: McapError,
     },
 }
 
-/// The text of an error, with its cause: that of the library says that writing failed, its cause has the reason.
+/// The text of an error, with its cause: the library's text says that writing failed, the cause has the reason.
 pub(super) fn with_cause(error: &McapError) -> String {
     std::error::Error::source(error).map_or(error.to_string(), |cause| format!("{error}: {cause}"))
 }
@@ -77,8 +77,8 @@ pub trait Files: Send {
     /// The path of the part while it is written.
     fn path(&self, part: u64) -> PathBuf;
 
-    /// Links those of these parts that are not deleted into a folder of their own, where they stay when old parts are
-    /// deleted; returns the links.
+    /// Links the `parts` that are not deleted into a folder of their own, where they stay when old parts are deleted;
+    /// returns the links.
     ///
     /// # Errors
     /// [`io::Error`] if all are deleted or the disk fails.
@@ -256,7 +256,7 @@ impl Files for Folder {
     fn keep(&mut self, parts: &[u64], name: &str) -> io::Result<Vec<PathBuf>> {
         let left = |part: &u64| {
             let (finished, unfinished) = (self.finished(*part), self.path(*part));
-            // A part that is still written is whole as soon as it is closed: the link is the same file. One that the
+            // A part that is still written is whole as soon as it is closed: the link is the same file. A part that the
             // disk has refused stays unfinished.
             match unfinished.exists() && !finished.exists() {
                 true if is_being_written(&unfinished) => (unfinished, finished),
@@ -317,7 +317,7 @@ fn is_unfinished(path: &Path) -> bool {
     path.to_string_lossy().ends_with(".unfinished.mcap")
 }
 
-/// True if a recorder writes the file, also that of another process.
+/// True if a recorder of this or another process writes the file.
 pub fn is_being_written(path: &Path) -> bool {
     match File::open(path).map(|file| file.try_lock_shared()) {
         Ok(Ok(())) => false,
@@ -342,7 +342,7 @@ fn rename_new(from: &Path, to: &Path) -> io::Result<()> {
     match fs::hard_link(from, to) {
         Ok(()) => fs::remove_file(from),
         Err(error) if error.kind() == ErrorKind::AlreadyExists => Err(error),
-        // A file system without links, such as that of a memory stick.
+        // A file system without links, as on a memory stick.
         Err(_) if !to.exists() => fs::rename(from, to),
         Err(_) => Err(ErrorKind::AlreadyExists.into()),
     }

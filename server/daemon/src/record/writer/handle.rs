@@ -34,7 +34,7 @@ const AFTER_LOSS_NS: u64 = 1_000_000_000;
 
 /// One element of the recorder's queue.
 pub(super) enum Item {
-    /// An event.
+    /// An event of the vehicle with this index.
     Event(usize, Event),
     /// A map, and the hop that ends when it is written.
     Map(usize, Arc<EncodedMap>, Hop),
@@ -185,7 +185,7 @@ impl RecordingHandle {
     /// when it has seen enough.
     pub fn keep_up(&mut self, event: &Event, own: &mut Pipeline) {
         let Some(warm_up) = &mut self.warm_up else { return };
-        // Its outcome is that of the vehicle's own pipeline, which has reported it.
+        // Its outcome equals the outcome of the vehicle's own pipeline, which is reported.
         let _ = warm_up.pipeline.step(event);
         // After a step back of the host's clock the time counts again from there.
         warm_up.from_ns = warm_up.from_ns.min(event.arrival_ns);
@@ -255,7 +255,7 @@ impl RecordingHandle {
         }
     }
 
-    /// Remembers an event that stays in force, in place of the one that it replaces.
+    /// Remembers an event that stays in force, in place of the event that it replaces.
     fn keep_in_force(&mut self, event: &Event) {
         match &event.body {
             Body::Sensor(_) => {

@@ -5,7 +5,7 @@
 //! | `handle` | one vehicle's events and maps -> the queue; the pipeline of the vehicle's next keyframe |
 //! | `recording` | the queue -> parts on the disk |
 //! | `part` | one open part: its file, its counts |
-//! | `folder` | parts -> files: names, links of saved parts, deletion of old ones |
+//! | `folder` | parts -> files: names, links of saved parts, deletion of old parts |
 //! | `counts` | what was offered, written, dropped and is durable |
 //! | `control` | requests of operators -> the recorder's thread |
 //!
@@ -49,7 +49,7 @@ const FINISH_TIME_MAX: Duration = Duration::from_secs(5);
 /// Interval at which the end of the recorder's thread is looked for.
 const FINISH_POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-/// The running recorder.
+/// The recorder of a running server, with its thread.
 #[derive(Debug)]
 pub struct Recorder {
     control: RecorderControl,

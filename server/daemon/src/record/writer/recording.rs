@@ -1,7 +1,7 @@
 //! The recorder without a thread of its own: items of the queue -> parts on the disk. Its owner passes the time; only
 //! messages before the first event have the system's time.
 //!
-//! At most two parts are open: the one that is recorded, and the next one while vehicles warm up for it. A part that
+//! At most two parts are open: the part that is recorded, and the next part while vehicles warm up for it. A part that
 //! the disk refuses is left as it is; after [`RETRY`] the next part begins, if the disk takes it.
 
 use std::collections::VecDeque;
@@ -149,7 +149,7 @@ impl<F: Files> RecordingWriter<F> {
         is_item
     }
 
-    /// Ends the recording.
+    /// Writes the items that are still queued and closes the file.
     pub fn finish(mut self) {
         while let Ok(item) = self.items.try_recv() {
             self.write(item, Instant::now());
@@ -428,7 +428,7 @@ impl<F: Files> RecordingWriter<F> {
         self.fail_part(number, error, now);
     }
 
-    /// Notes that the disk refuses a part, of which what it has taken stays.
+    /// Notes that the disk refuses a part; what the disk has taken of it stays.
     fn fail_part(&mut self, number: u64, error: &McapError, now: Instant) {
         let left = self.files.path(number);
         self.fail(&format!("{}; what was written before is in {}", with_cause(error), left.display()), now);
@@ -465,7 +465,7 @@ impl<F: Files> RecordingWriter<F> {
         }
     }
 
-    /// Writes the final counts and closing records of a part, and gives it its name; deletes one that is not needed.
+    /// Writes the final counts and closing records of a part, and gives it its name; deletes a part that is not needed.
     fn close(&mut self, part: Part<F::File>, now: Instant) {
         let number = part.number;
         let losses = if part.topics.iter().any(|(_, dropped)| *dropped > 0) { &*self.reason } else { "" };

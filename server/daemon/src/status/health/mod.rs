@@ -1,7 +1,7 @@
 //! How well a vehicle is served: what is known of it at one time -> `ok`, `warn` or `error`, with reasons in words.
 //!
 //! Pure: [`findings`] is a function of [`Facts`], and [`Health`] adds what is remembered from one assessment to the
-//! next. A state that gets worse is believed at once, one that gets better only after [`BETTER_AFTER`].
+//! next. A worse state is believed at once, a better state only after [`BETTER_AFTER`].
 
 use std::time::Duration;
 
@@ -23,11 +23,11 @@ const LOSS_WARNS: f64 = 0.01;
 const LOSS_ENDS: f64 = 0.005;
 /// Completeness of the newest revolution below which a sensor warns. Ours.
 const COMPLETENESS_MIN: f32 = 0.9;
-/// Packets of a revolution beside those that its model sends, above which they are of another model. Ours: an HDL-32E,
-/// which can be read as a VLP-16, sends 2.4 times as many.
+/// Greatest ratio of a revolution's packets to the packets that its model sends; above it they are of another model.
+/// Ours: an HDL-32E, which can be read as a VLP-16, sends 2.4 times as many.
 const MODEL_PACKETS_MAX: f64 = 1.5;
 
-/// State of a vehicle, better ones first.
+/// State of a vehicle, better states first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum State {
     /// Fresh maps are made, and nothing is known to be wrong.
@@ -49,7 +49,7 @@ impl State {
         }
     }
 
-    /// All states.
+    /// All states, from the best to the worst.
     pub const ALL: [Self; 3] = [Self::Ok, Self::Warn, Self::Error];
 }
 
@@ -76,13 +76,13 @@ pub struct Facts {
     pub replay: Option<(ReplayPhase, Duration)>,
     /// What the replay waits for in lockstep; empty: nothing.
     pub replay_awaited: String,
-    /// The sensors.
+    /// Facts of each of the vehicle's sensors.
     pub sensors: Vec<SensorFacts>,
     /// The addresses that sent datagrams in the last seconds and are none of the vehicle's sensors.
     pub unknown_senders: Vec<String>,
     /// Share of the packets of the last 10 s that were lost or refused, 0 to 1; `None` if none was expected.
     pub loss: Option<f64>,
-    /// What is wrong with the recording.
+    /// Fault of the recording, in words; `None` if there is none.
     pub recorder_problem: Option<String>,
     /// What is wrong with the long-term store.
     pub store_problem: Option<String>,
@@ -104,7 +104,7 @@ pub struct SensorFacts {
     /// Why its newest scan is not, or not as it should be, in the newest map: "late", "ahead", "empty",
     /// "silent"; else empty.
     pub left_out: String,
-    /// Covered share of its newest revolution.
+    /// Share of the sensor's newest revolution that is covered, 0 to 1.
     pub completeness: Option<f32>,
     /// Packets of its newest revolution, if it is whole, and how many its model sends in one.
     pub packets: Option<[u32; 2]>,
@@ -125,9 +125,9 @@ pub struct SensorFacts {
 /// One thing that is wrong.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {
-    /// How bad it is.
+    /// State that the finding causes.
     pub state: State,
-    /// What it is, in words.
+    /// The fault, in words.
     pub text: String,
 }
 
@@ -170,7 +170,7 @@ impl Health {
         self.state != before
     }
 
-    /// The state.
+    /// State of the newest assessment.
     pub fn state(&self) -> State {
         self.state
     }
@@ -244,7 +244,7 @@ fn expects_data(facts: &Facts) -> bool {
     facts.replay.is_none_or(plays)
 }
 
-/// Sensors of which nothing arrives. One of several is a warning, because the others make maps.
+/// Sensors from which nothing arrives. One silent sensor of several is a warning, because the others make maps.
 fn silence(facts: &Facts, add: &mut impl FnMut(State, String)) {
     if !expects_data(facts) {
         return;

@@ -36,13 +36,13 @@ pub struct WrongFootprint {
 /// Counts of whole footprints of one layer.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FootprintTally {
-    /// Free footprints on one level, and those answered free, by band.
+    /// Free footprints on one level, and how many are answered free, by band.
     pub level: Bands,
     /// The same of free footprints across a kerb or another step.
     pub stepped: Bands,
-    /// Footprints whose highest thing is of a kind of [`HELD_M`], and those answered free, by kind and band.
+    /// Footprints whose highest thing is of a kind of [`HELD_M`], and how many are answered free, by kind and band.
     pub holding: [Bands; HELD_M.len()],
-    /// Footprints over ground that cannot be reached, with nothing in them, and those answered free, by band.
+    /// Footprints over ground that cannot be reached, with nothing in them, and how many are answered free, by band.
     pub unreachable: Bands,
     /// Free footprints that are not answered free, by the class of the cell that forbids it.
     pub refused: BTreeMap<String, u64>,
@@ -58,7 +58,7 @@ impl FootprintTally {
         }
     }
 
-    /// Free footprints on one level, and those answered free, in a range whose ends are bounds of bands.
+    /// Free footprints on one level, and how many are answered free, in a range whose ends are bounds of bands.
     pub fn level_within(&self, from_m: f64, to_m: f64) -> CellCount {
         within(&self.level, from_m, to_m)
     }

@@ -34,7 +34,7 @@ pub struct CutObject {
     height_m: f32,
 }
 
-/// The objects.
+/// The objects that are put into scans.
 pub const OBJECTS: [CutObject; 6] = [
     CutObject { name: "box of 0.5 m", size_m: [0.5, 0.5], height_m: 0.5 },
     CutObject { name: "log of 0.2 m", size_m: [0.3, 2.0], height_m: 0.2 },
@@ -90,7 +90,7 @@ pub fn judge_objects(
     Ok(())
 }
 
-/// The cells of a layer at these places, and those called free; `None` if the layer has no free class.
+/// The cells of a layer at these places, and the cells among them called free; `None` if the layer has no free class.
 fn count(layer: &Layer, places: &[[f32; 3]]) -> Option<CellCount> {
     let (meanings, cell_of) = (meanings(layer)?, locate(&layer.geometry));
     let cells: BTreeSet<usize> = places.iter().filter_map(|place| cell_of(*place)).collect();

@@ -126,9 +126,9 @@ impl FoundFiles {
         true
     }
 
-    /// The scans that may belong to these labels: those beside it, else those in SemanticKITTI's folder for them, else
-    /// those of that name in the other folders of the same parent. Labels that are elsewhere than all scans may belong
-    /// to any scan of their name.
+    /// The scans that may belong to these labels: the scans beside the file, else the scans in SemanticKITTI's folder
+    /// for scans, else the scans of its name in the other folders of the same parent. Labels that are elsewhere than
+    /// all scans may belong to any scan of their name.
     fn scans_of(&self, labels: &Path, are_elsewhere: bool) -> Vec<&Path> {
         let all = || self.scans.iter().map(PathBuf::as_path).filter(|scan| stem(scan) == stem(labels));
         let (folder, above) = (labels.parent(), labels.parent().and_then(Path::parent));

@@ -1,8 +1,8 @@
 //! A labelled scan -> the same scan as it would be of another world or of another sensor.
 //!
 //! In: a scan in the sensor frame, its mount. Out: a [`Varied`] scan with the index of each of its points in the
-//! original, by which the truth of a point is that of the original point, and the extrinsics that the maps get. The
-//! truth is so transformed with the scan.
+//! original, and the extrinsics that the maps get. A point has the truth of its original point, so the truth is
+//! transformed with the scan.
 
 use std::fmt;
 
@@ -13,7 +13,7 @@ use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 
 /// Range from which a bent world leaves the plane under the vehicle, in metres.
 const BEND_FROM_M: f64 = 8.0;
-/// Number of lasers of the scans of which lasers are kept.
+/// Number of lasers that a scan needs for a variation that keeps some of its lasers.
 const LASERS: u16 = 64;
 
 /// How a scan is varied.
@@ -34,7 +34,7 @@ pub enum Variation {
     SensorOffset(f64),
 }
 
-/// A varied scan.
+/// A scan after a [`Variation`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Varied {
     /// The scan, sensor frame.

@@ -1,7 +1,7 @@
 //! Simulated scenes -> maps of the pipeline, with the simulator's truth about every point.
 //!
 //! In: a scene. Out: for each frame a map and its [`JudgedPoint`]s. The vehicle's datagrams, and its pose every 10 ms,
-//! are the events; the truth is that of the end of the map's capture.
+//! are the events; the truth describes the end of the map's capture.
 
 use anyhow::Result;
 use bytes::Bytes;

@@ -20,9 +20,9 @@ use super::super::judge::{JudgedPoint, Scored};
 /// The files of one frame of a report.
 #[derive(Clone, Copy, Debug)]
 pub struct WrittenFrame<'a> {
-    /// Folder of its files.
+    /// Folder of the frame's files.
     pub folder: &'a Path,
-    /// Name of its files.
+    /// Name of the frame's files.
     pub name: &'a str,
     /// The path that was evaluated, as given.
     pub path: &'a str,

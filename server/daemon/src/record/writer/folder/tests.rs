@@ -17,7 +17,7 @@ fn a_new_run_never_overwrites_an_earlier_recording() {
     }
     File::create(temporary.path().join("car-3.unfinished.mcap")).unwrap();
     assert_eq!(next_free_name(&file), temporary.path().join("car-4.mcap"));
-    // The first parts of a run are deleted before its last ones.
+    // The first parts of a run are deleted before its last parts.
     fs::remove_file(&file).unwrap();
     fs::rename(temporary.path().join("car-1.mcap"), temporary.path().join("car.part-0007.mcap")).unwrap();
     assert_eq!(next_free_name(&file), temporary.path().join("car-1.mcap"));
