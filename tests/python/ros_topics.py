@@ -105,7 +105,11 @@ def main(endpoint, domain):
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
         topics, messages = publishers(session, domain), {}
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        # As rmw_zenoh subscribes to a latched, reliable topic: a message that was dropped on the way is asked for.
+        latched = {
+            "history": zenoh.ext.HistoryConfig(detect_late_publishers=True),
+            "recovery": zenoh.ext.RecoveryConfig(heartbeat=True),
+        }
         for topic, token in topics.items():
             name = ros_type(token["type"])
             assert token["hash"] == STORE.hash_rihs01(name), name
@@ -128,9 +132,9 @@ def main(endpoint, domain):
                 continue
             # Nothing is published after the second subscriber comes, so its map is from the cache.
             early, late = queue.Queue(), queue.Queue()
-            first = zenoh.ext.declare_advanced_subscriber(session, key, early.put, history=history)
+            first = zenoh.ext.declare_advanced_subscriber(session, key, early.put, **latched)
             messages[topic] = described(early.get(timeout=60), name)
-            second = zenoh.ext.declare_advanced_subscriber(session, key, late.put, history=history)
+            second = zenoh.ext.declare_advanced_subscriber(session, key, late.put, **latched)
             assert described(late.get(timeout=60), name) == messages[topic], topic
             first.undeclare()
             second.undeclare()

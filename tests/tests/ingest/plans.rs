@@ -184,7 +184,8 @@ async fn a_plan_over_zenoh_is_taken_or_counted() {
     let of_another = v1::Plan { vehicle: "van".into(), ..good.clone() }.encode_to_vec();
     let nowhere = v1::Plan { x: vec![], y: vec![], ..good.clone() }.encode_to_vec();
     for (count, bytes) in (1..).zip([of_another, nowhere, vec![0xff], vec![0; 200_000]]) {
-        within("zenoh", async { session.put("clearway/car/plan", bytes).await }).await.unwrap();
+        let put = session.put("clearway/car/plan", bytes).congestion_control(CongestionControl::Block);
+        within("zenoh", async { put.await }).await.unwrap();
         until("the refusal is counted", || refused(&running) == count).await;
     }
     // More plans at once than may wait: plans that the rate cannot have let through are counted.

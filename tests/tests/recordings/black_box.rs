@@ -17,7 +17,7 @@ use clearway_daemon::run::{Running, Server, Setup};
 use clearway_daemon::store::index::Entry;
 use clearway_daemon::traces::Traces;
 use clearway_journal::encode::EncodedMap;
-use clearway_journal::mcap_file::{Disk, RecordingHeader};
+use clearway_journal::mcap_file::{Disk, RecordingHeader as Header};
 use clearway_journal::mcap_reader::McapReader;
 use clearway_journal::reader::{RecordedMessage, RecordingReader};
 use clearway_lidar::model::Model;
@@ -192,11 +192,7 @@ fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_
     let (config, disk) = (with_short_warm_up(config()), FailingDisk::default());
     let core = config.vehicles[0].core();
     let options = Recorder { warm_up_ms: 2000, ..Recorder::default() };
-    let header = RecordingHeader {
-        vehicles: vec![("car".into(), vec![])],
-        config: config.to_toml(),
-        ..RecordingHeader::default()
-    };
+    let header = Header { vehicles: vec![("car".into(), vec![])], config: config.to_toml(), ..Header::default() };
     let began = Instant::now();
     let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
     let (counts, mut pipeline) = (writer.counts(), Pipeline::new(&core, vec![None]).unwrap());
@@ -253,7 +249,7 @@ fn each_message_also_of_a_silent_van_has_a_time_of_the_drive_and_a_chunk_half_a_
     let core = config.vehicles[0].core();
     let options = Recorder { part_s: 2, warm_up_ms: 0, flush_ms: 60_000, ..Recorder::default() };
     let vehicles = ["car", "van"].map(|name| (name.into(), vec![])).into();
-    let header = RecordingHeader { vehicles, config: config.to_toml(), ..RecordingHeader::default() };
+    let header = Header { vehicles, config: config.to_toml(), ..Header::default() };
     let began = Instant::now();
     let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
     let mut pipelines = [(); 2].map(|()| Pipeline::new(&core, vec![None]).unwrap());
@@ -289,11 +285,7 @@ fn each_message_also_of_a_silent_van_has_a_time_of_the_drive_and_a_chunk_half_a_
 fn each_event_is_durable_within_flush_ms_if_a_sync_takes_no_more_than_half_of_it() {
     let (config, disk) = (with_short_warm_up(config()), FailingDisk::default());
     let options = Recorder { flush_ms: 1000, ..Recorder::default() };
-    let header = RecordingHeader {
-        vehicles: vec![("car".into(), vec![])],
-        config: config.to_toml(),
-        ..RecordingHeader::default()
-    };
+    let header = Header { vehicles: vec![("car".into(), vec![])], config: config.to_toml(), ..Header::default() };
     let began = Instant::now();
     let (mut writer, mut handles) = RecordingWriter::new(disk, &options, &header, false, began).unwrap();
     let counts = writer.counts();
@@ -333,7 +325,7 @@ fn of_what_a_slow_disk_does_not_take_each_topic_counts_the_same_live_and_in_the_
     let options = Recorder { warm_up_ms: 500, queue: 100, ..Recorder::default() };
     let mut pipeline = Pipeline::new(&core, vec![None]).unwrap();
     let vehicles = vec![("car".into(), layer_names(&core.maps))];
-    let header = RecordingHeader { vehicles, config: config.to_toml(), ..RecordingHeader::default() };
+    let header = Header { vehicles, config: config.to_toml(), ..Header::default() };
     let began = Instant::now();
     let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
     let (counts, handle) = (writer.counts(), &mut handles[0]);
@@ -390,11 +382,7 @@ fn of_what_a_slow_disk_does_not_take_each_topic_counts_the_same_live_and_in_the_
 fn a_part_without_a_message_gets_no_successor() {
     let disk = FailingDisk::default();
     let options = Recorder { part_s: 1, ..Recorder::default() };
-    let header = RecordingHeader {
-        vehicles: vec![("car".into(), vec![])],
-        config: config().to_toml(),
-        ..RecordingHeader::default()
-    };
+    let header = Header { vehicles: vec![("car".into(), vec![])], config: config().to_toml(), ..Header::default() };
     let began = Instant::now();
     let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
     let parts = || disk.files.lock().unwrap().len();

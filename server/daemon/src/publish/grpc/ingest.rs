@@ -2,9 +2,9 @@
 //!
 //! A stream reads its next observation only while its events in flight are within the vehicle's limits and the peer
 //! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine
-//! returns the outcome of each event by its [`Receipt`](crate::ingest::receipt::Receipt); the stream collects outcomes into as
-//! few reports as the transport can send. It runs in a task of its own, so that a peer that takes no reports keeps
-//! neither a permit nor an event.
+//! returns the outcome of each event by its [`Receipt`](crate::ingest::receipt::Receipt); the stream collects outcomes
+//! into as few reports as the transport can send. It runs in a task of its own, so that a peer that takes no reports
+//! keeps neither a permit nor an event.
 
 use std::error::Error;
 use std::net::Ipv4Addr;
