@@ -51,7 +51,7 @@ check_libraries "$root/$name/bin/clearway"
 cp -R LICENSE README.md CHANGELOG.md SECURITY.md deploy "$root/$name"
 cp -R --parents server/README.md server/guide client/README.md client/guide client/ros2 "$root/$name"
 tar -C "$root" --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" -c "$name" |
-    gzip -9n >"$folder/$name.tar.gz"
+    gzip -n >"$folder/$name.tar.gz"
 deploy/debian/make-deb.sh "$binary" "$folder"
 deploy/make-sbom.sh "$folder"
 

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use clearway_tests::simulation::{Failure, InjectedFault, Outcome, run};
 
 /// Seeds of a test; the program `campaign` runs as many as wanted.
-const SEEDS: u64 = 100;
+const SEEDS: u64 = 40;
 /// Seeds among which an injected fault must be found.
 const INJECTED: u64 = 24;
 
@@ -25,7 +25,7 @@ fn all(seeds: u64) -> Vec<Result<Outcome, Failure>> {
 }
 
 #[test]
-fn every_fault_of_a_hundred_seeds_is_counted_and_recovered_from() {
+fn every_fault_of_forty_seeds_is_counted_and_recovered_from() {
     let (good, failed): (Vec<_>, Vec<_>) = all(SEEDS).into_iter().partition(Result::is_ok);
     let failed: Vec<String> = failed.into_iter().filter_map(Result::err).map(|failure| failure.to_string()).collect();
     assert!(failed.is_empty(), "{} of {SEEDS} seeds fail:\n{}", failed.len(), failed.join("\n"));
@@ -33,7 +33,7 @@ fn every_fault_of_a_hundred_seeds_is_counted_and_recovered_from() {
     let sum = |of: &dyn Fn(&Outcome) -> u64| good.iter().flatten().map(of).sum::<u64>();
     let (refused, lost, skipped) = (sum(&|run| run.refused), sum(&|run| run.lost), sum(&|run| run.read.1));
     let whole = sum(&|run| u64::from(run.recorded));
-    assert!(refused > 1000 && lost > 100 && skipped > 100, "{refused} refused, {lost} lost, {skipped} skipped");
+    assert!(refused > 400 && lost > 40 && skipped > 40, "{refused} refused, {lost} lost, {skipped} skipped");
     assert!((SEEDS / 4..SEEDS * 3 / 4).contains(&whole), "{whole} recordings are whole");
 }
 
