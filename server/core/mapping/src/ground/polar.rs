@@ -30,7 +30,7 @@ const KEPT: usize = 3;
 /// Return of a cell without one.
 const NONE: u32 = u32::MAX;
 /// A cell without returns.
-const EMPTY: PolarCell = PolarCell { lowest: [NONE; KEPT], highest: 0 };
+const EMPTY: PolarCell = PolarCell([NONE; KEPT + 1]);
 /// Offset that makes each height positive, metres, plus half a millimetre for rounding.
 const OFFSET_M: f32 = 32.0005;
 /// Steps of a return's place within its cell, along the range and along the azimuth.
@@ -48,21 +48,18 @@ pub struct Return {
 }
 
 /// The returns that are kept of a cell: height in millimetres in the upper 16 bits, then the place within the cell
-/// along the range and along the azimuth, 8 bits each.
+/// along the range and along the azimuth, 8 bits each. The lowest ones come first, ascending; then the complement of
+/// the highest one.
 #[derive(Clone, Copy)]
-struct PolarCell {
-    /// Ascending.
-    lowest: [u32; KEPT],
-    highest: u32,
-}
+struct PolarCell([u32; KEPT + 1]);
 
 impl PolarCell {
-    /// It has no branches: which returns are kept cannot be predicted.
+    /// It has no branches: which returns are kept cannot be predicted. Four numbers fill a register.
     #[inline(always)]
     fn add_return(&mut self, key: u32) {
-        let [first, second, third] = self.lowest;
-        self.lowest = [first.min(key), first.max(key).min(second), second.max(key).min(third)];
-        self.highest = self.highest.max(key);
+        let [first, second, ..] = self.0;
+        let (before, new) = ([0, first, second, 0], [key, key, key, !key]);
+        self.0 = std::array::from_fn(|i| self.0[i].min(before[i].max(new[i])));
     }
 }
 
@@ -99,18 +96,19 @@ impl PolarCells {
 
     /// The up to three lowest returns of a cell, lowest first.
     pub fn lowest(&self, cell: usize) -> impl Iterator<Item = Return> {
-        self.cells[cell].lowest.into_iter().take_while(|key| *key != NONE).map(move |key| unpack(cell / COLUMNS, key))
+        let lowest = self.cells[cell].0.into_iter().take(KEPT).take_while(|key| *key != NONE);
+        lowest.map(move |key| unpack(cell / COLUMNS, key))
     }
 
     /// True if the cell has a return.
     pub fn is_seen(&self, cell: usize) -> bool {
-        self.cells[cell].lowest[0] != NONE
+        self.cells[cell].0[0] != NONE
     }
 
     /// Height of the cell's highest return over its lowest one, metres; 0 without returns.
     pub fn span_m(&self, cell: usize) -> f32 {
-        let PolarCell { lowest: [lowest, ..], highest } = self.cells[cell];
-        if lowest == NONE { 0.0 } else { ((highest >> 16) as f32 - (lowest >> 16) as f32) * 1e-3 }
+        let PolarCell([lowest, .., highest]) = self.cells[cell];
+        if lowest == NONE { 0.0 } else { ((!highest >> 16) as f32 - (lowest >> 16) as f32) * 1e-3 }
     }
 
     /// Coordinates of a position; see [`coordinates`].
@@ -238,9 +236,37 @@ pub fn beside(column: usize, beside: isize) -> usize {
     (column + COLUMNS).wrapping_add_signed(beside) % COLUMNS
 }
 
+/// Marks the cells that are marked in `marked` or share a side or a corner with one that is, and no others.
+pub fn mark_around(marked: &[bool], around: &mut [bool]) {
+    for (row, around) in around.chunks_exact_mut(COLUMNS).enumerate() {
+        let (mut in_column, rows) = ([false; COLUMNS], row.saturating_sub(1) * COLUMNS..(row + 2).min(ROWS) * COLUMNS);
+        for marked in marked[rows].chunks_exact(COLUMNS) {
+            in_column.iter_mut().zip(marked).for_each(|(any, marked)| *any |= marked);
+        }
+        for (column, around) in around.iter_mut().enumerate() {
+            *around = [-1, 0, 1].into_iter().fold(false, |any, offset| any | in_column[beside(column, offset)]);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_cells_around_one_share_a_side_or_a_corner_with_it() {
+        let mut around = vec![false; CELLS];
+        for (row, column) in [(0, 0), (1, 7), (20, COLUMNS - 1), (ROWS - 1, 100)] {
+            let mut marked = vec![false; CELLS];
+            marked[row * COLUMNS + column] = true;
+            mark_around(&marked, &mut around);
+            for (cell, is_around) in around.iter().enumerate() {
+                let (other_row, other) = (cell / COLUMNS, cell % COLUMNS);
+                let expected = row.abs_diff(other_row) <= 1 && [0, 1, COLUMNS - 1].contains(&column.abs_diff(other));
+                assert_eq!(*is_around, expected, "{row} {column}, {other_row} {other}");
+            }
+        }
+    }
 
     #[test]
     fn returns_right_before_the_end_of_the_last_row_are_in_it_or_left_out() {

@@ -13,9 +13,9 @@ use crate::sensor::deviation::{Deviation, STEPS};
 /// Cell of a point that lies in no cell.
 pub const NOWHERE: u32 = u32::MAX;
 
-/// Sums of one cell.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Sums {
+/// Sums of the deviations of one cell.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RoughnessSums {
     points: i64,
     deviations: i64,
     /// Squares of the deviations.
@@ -24,41 +24,24 @@ struct Sums {
     noise: i64,
 }
 
-/// Sums of the deviations by cell.
-#[derive(Clone, Debug, Default)]
-pub struct Roughness {
-    sums: Vec<Sums>,
-}
+impl RoughnessSums {
+    /// No points.
+    pub const EMPTY: Self = Self { points: 0, deviations: 0, squares: 0, noise: 0 };
 
-impl Roughness {
-    /// Removes all points, and sets the number of cells.
-    pub fn clear(&mut self, cells: usize) {
-        self.sums.clear();
-        self.sums.resize(cells, Sums::default());
-    }
-
-    /// Adds one more cell without points.
-    pub fn push_cell(&mut self) {
-        self.sums.push(Sums::default());
-    }
-
-    /// Adds points to their cells. A point of no cell ([`NOWHERE`]) and a deviation that is not known are left out.
-    pub fn add_points(&mut self, cells: &[u32], deviations: &[Deviation]) {
-        for (&cell, &deviation) in cells.iter().zip(deviations) {
-            if let Some([deviation, noise]) = deviation.steps()
-                && let Some(sums) = self.sums.get_mut(cell as usize)
-            {
-                sums.points += 1;
-                sums.deviations += deviation;
-                sums.squares += deviation * deviation;
-                sums.noise += noise * noise;
-            }
+    /// Adds a point, unless its deviation is not known.
+    #[inline(always)]
+    pub fn add(&mut self, deviation: Deviation) {
+        if let Some([deviation, noise]) = deviation.steps() {
+            self.points += 1;
+            self.deviations += deviation;
+            self.squares += deviation * deviation;
+            self.noise += noise * noise;
         }
     }
 
-    /// Roughness of a cell; `None` with fewer points than `points_min`.
-    pub fn of_cell(&self, cell: usize, points_min: u16) -> Option<f32> {
-        let Sums { points, deviations, squares, noise } = self.sums[cell];
+    /// Roughness of the cell; `None` with fewer points than `points_min`.
+    pub fn roughness(&self, points_min: u16) -> Option<f32> {
+        let Self { points, deviations, squares, noise } = *self;
         if points == 0 || points < i64::from(points_min) {
             return None;
         }
@@ -76,17 +59,17 @@ mod tests {
 
     #[test]
     fn the_noise_of_the_sensor_is_no_roughness() {
-        let mut roughness = Roughness::default();
-        roughness.clear(3);
+        let mut cells = [RoughnessSums::EMPTY; 3];
         for number in 0..1000 {
             let sign = if number % 2 == 0 { 1.0 } else { -1.0 };
-            let points = [[0.001 * sign, 0.001], [0.005 * sign, 0.003], [0.1, 0.0]];
-            roughness.add_points(&[0, 1, NOWHERE], &points.map(|[deviation, noise]| Deviation::new(deviation, noise)));
+            cells[0].add(Deviation::new(0.001 * sign, 0.001));
+            cells[1].add(Deviation::new(0.005 * sign, 0.003));
         }
-        roughness.add_points(&[2, 2], &[Deviation::new(f32::NAN, f32::NAN), Deviation::new(3.0, 0.001)]);
-        assert_eq!(roughness.of_cell(0, 4), Some(0.0));
-        assert!((roughness.of_cell(1, 4).unwrap() - 0.004).abs() < 1e-6);
-        assert_eq!(roughness.of_cell(1, 1001), None);
-        assert_eq!(roughness.of_cell(2, 0), None);
+        cells[2].add(Deviation::new(f32::NAN, f32::NAN));
+        cells[2].add(Deviation::new(3.0, 0.001));
+        assert_eq!(cells[0].roughness(4), Some(0.0));
+        assert!((cells[1].roughness(4).unwrap() - 0.004).abs() < 1e-6);
+        assert_eq!(cells[1].roughness(1001), None);
+        assert_eq!(cells[2].roughness(0), None);
     }
 }

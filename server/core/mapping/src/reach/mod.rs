@@ -37,7 +37,7 @@ mod troughs;
 use std::sync::Arc;
 
 use crate::ground::Ground;
-use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
+use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, mark_around};
 use crate::ground::surface::Confidence;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
@@ -65,14 +65,14 @@ const STRIP_M: f32 = 1.0;
 #[repr(u8)]
 enum View {
     /// It does not: no ground was seen around it.
-    Closed = 0,
+    Closed,
     /// It does.
-    Clear = 0b01,
+    Clear,
     /// It does where no obstacle casts a shadow on it.
-    BesideObstacle = 0b10,
+    BesideObstacle,
     /// It does not, because an obstacle hides it: where no ground is known, and in a gap of seen ground.
-    Hidden = 0b100,
-    HiddenGap = 0b1100,
+    Hidden,
+    HiddenGap,
 }
 
 /// Cell of [`Reach`] that contains a position; [`ReachCell::at`] finds it once for a fixed position.
@@ -121,8 +121,9 @@ pub struct Reach {
     seen_now: Bits,
     troughs: Troughs,
     shadow: Shadow,
-    /// True by polar cell if an obstacle stands in it.
+    /// True by polar cell if an obstacle stands in it; in it or in one of the eight around it.
     has_obstacle: Vec<bool>,
+    beside_obstacle: Vec<bool>,
     /// By polar cell.
     views: Vec<View>,
     open: Bits,
@@ -165,6 +166,7 @@ impl Reach {
             troughs: Troughs::new(),
             shadow: Shadow::new(Arc::clone(&PLACES.of_shadows)),
             has_obstacle: vec![false; CELLS],
+            beside_obstacle: vec![false; CELLS],
             views: vec![View::Closed; CELLS],
             open: bits.clone(),
             hidden: bits.clone(),
@@ -319,9 +321,9 @@ impl Reach {
         self.places.polar_of_cell[cell]
     }
 
-    /// Writes the lowest bit of the value of each cell's polar cell.
+    /// Sets the bits of the cells whose polar cell has the value 1, not 0, and clears the others.
     pub(crate) fn copy_polar(&self, value_of: impl Fn(PolarIndex) -> u8 + Copy, cells: &mut Bits) {
-        cells.fill_words(|of_word| self.places.polar_runs.bits::<1>(of_word.start / WORD, value_of)[0]);
+        cells.fill_words(|of_word| self.places.polar_runs.bits::<2>(of_word.start / WORD, value_of)[1]);
     }
 
     /// Floods the ground again with more barred cells; `flood` and `barred` are the caller's.
@@ -351,12 +353,14 @@ impl Reach {
         self.classify_polar_cells(confidences);
         self.assume_near_ground(confidences);
         let (runs, shadow, views) = (&self.places.polar_runs, &self.shadow, &self.views);
-        let (hidden, gaps) = (&mut self.hidden, &mut self.hidden_gaps);
+        let (hidden, gaps, seen) = (&mut self.hidden, &mut self.hidden_gaps, self.steps.seen().words());
         self.open.fill_words(|cells| {
             let view_of = |polar: PolarIndex| polar.of(views).map_or(View::Closed as u8, |view| *view as u8);
-            let [mut clear, mut beside, behind, gap] = runs.bits(cells.start / WORD, view_of);
-            hidden.set_word(cells.start / WORD, behind | beside);
+            let [_, mut clear, mut beside, behind, gap] = runs.bits(cells.start / WORD, view_of);
+            hidden.set_word(cells.start / WORD, behind | gap | beside);
             gaps.set_word(cells.start / WORD, gap | beside);
+            // Ground that was seen is open all the same.
+            beside &= !seen[cells.start / WORD];
             while beside != 0 {
                 let bit = beside.trailing_zeros() as usize;
                 clear |= u64::from(!shadow.hides(cells.start + bit)) << bit;
@@ -389,23 +393,22 @@ impl Reach {
 
     /// Decides for each polar cell whether its unseen ground counts as free of obstacles.
     fn classify_polar_cells(&mut self, confidences: &[Confidence]) {
-        for column in 0..COLUMNS {
-            // An obstacle may hide a part of all ground behind it in its column.
-            let (mut is_hidden, mut is_behind) = (false, false);
-            for row in 0..ROWS {
-                let cell = row * COLUMNS + column;
-                is_hidden = self.has_obstacle[cell] || is_hidden && confidences[cell] != Confidence::Seen;
-                is_behind |= self.has_obstacle[cell];
-                self.views[cell] = match confidences[cell] {
-                    Confidence::Bridged if is_hidden => View::HiddenGap,
-                    Confidence::Extrapolated | Confidence::None if is_hidden => View::Hidden,
-                    Confidence::Seen | Confidence::Bridged if is_behind || self.is_beside_obstacle(row, column) => {
-                        View::BesideObstacle
-                    }
-                    Confidence::Seen | Confidence::Bridged => View::Clear,
-                    Confidence::Extrapolated | Confidence::None => View::Closed,
-                };
-            }
+        mark_around(&self.has_obstacle, &mut self.beside_obstacle);
+        // An obstacle may hide a part of all ground behind it in its column.
+        let (mut are_hidden, mut are_behind) = ([false; COLUMNS], [false; COLUMNS]);
+        for cell in 0..CELLS {
+            let (is_hidden, is_behind) = (&mut are_hidden[cell % COLUMNS], &mut are_behind[cell % COLUMNS]);
+            *is_hidden = self.has_obstacle[cell] | *is_hidden & (confidences[cell] != Confidence::Seen);
+            *is_behind |= self.has_obstacle[cell];
+            self.views[cell] = match confidences[cell] {
+                Confidence::Bridged if *is_hidden => View::HiddenGap,
+                Confidence::Extrapolated | Confidence::None if *is_hidden => View::Hidden,
+                Confidence::Seen | Confidence::Bridged if *is_behind | self.beside_obstacle[cell] => {
+                    View::BesideObstacle
+                }
+                Confidence::Seen | Confidence::Bridged => View::Clear,
+                Confidence::Extrapolated | Confidence::None => View::Closed,
+            };
         }
     }
 
@@ -420,33 +423,8 @@ impl Reach {
             });
             let Some(seen) = first.filter(|row| !self.has_obstacle[row * COLUMNS + column]) else { continue };
             for row in 0..seen {
-                let is_beside = self.is_beside_obstacle(row, column);
-                self.views[row * COLUMNS + column] = if is_beside { View::BesideObstacle } else { View::Clear };
-            }
-        }
-    }
-
-    fn is_beside_obstacle(&self, row: usize, column: usize) -> bool {
-        let rows = row.saturating_sub(1)..(row + 2).min(ROWS);
-        rows.flat_map(|row| [-1, 0, 1].map(|offset| row * COLUMNS + beside(column, offset)))
-            .any(|cell| self.has_obstacle[cell])
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_cells_beside_an_obstacle_share_a_side_or_a_corner_with_it() {
-        for (row, column) in [(0, 0), (1, 7), (20, COLUMNS - 1), (ROWS - 1, 100)] {
-            let mut reach = Reach::new(&ReachConfig::default());
-            reach.has_obstacle[row * COLUMNS + column] = true;
-            let near = |a: usize, b: usize| a.abs_diff(b) <= 1;
-            for cell in 0..ROWS * COLUMNS {
-                let (other_row, other) = (cell / COLUMNS, cell % COLUMNS);
-                let expected = near(row, other_row) && [0, 1, COLUMNS - 1].contains(&column.abs_diff(other));
-                assert_eq!(reach.is_beside_obstacle(other_row, other), expected, "{row} {column}, {other_row} {other}");
+                let cell = row * COLUMNS + column;
+                self.views[cell] = if self.beside_obstacle[cell] { View::BesideObstacle } else { View::Clear };
             }
         }
     }

@@ -80,16 +80,13 @@ impl PolarRuns {
         Self { runs, first_of_word }
     }
 
-    /// The bits of a word's cells, for each of `N` bits of the value of their polar cell, from the lowest on.
+    /// The bits of a word's cells whose polar cell has each of the values below `N`.
     #[inline(always)]
     pub fn bits<const N: usize>(&self, word: usize, of_polar: impl Fn(PolarIndex) -> u8) -> [u64; N] {
         let mut bits = [0; N];
         let runs = self.first_of_word[word] as usize..self.first_of_word[word + 1] as usize;
         for run in &self.runs[runs] {
-            let (value, of_run) = (of_polar(run.polar), run.bits());
-            for (bit, bits) in bits.iter_mut().enumerate() {
-                *bits |= u64::from(value >> bit & 1).wrapping_neg() & of_run;
-            }
+            bits[usize::from(of_polar(run.polar))] |= run.bits();
         }
         bits
     }
@@ -102,15 +99,16 @@ mod tests {
     use crate::ground::polar::CELLS;
 
     #[test]
-    fn each_cell_has_the_bits_of_its_polar_cell() {
+    fn each_cell_has_the_bit_of_the_value_of_its_polar_cell() {
         let polar: Vec<_> = (0..SIDE * SIDE).map(centre_m).map(|[x, y]| PolarIndex::at(x, y)).collect();
         let values: Vec<u8> = (0..CELLS as u32).map(|cell| (cell.wrapping_mul(2_654_435_761) >> 30) as u8).collect();
         let runs = PolarRuns::new(&polar);
         for (word, cells) in polar.chunks(WORD).enumerate() {
-            let [low, high] = runs.bits(word, |polar| *polar.of(&values).unwrap());
+            let bits: [u64; 4] = runs.bits(word, |polar| *polar.of(&values).unwrap());
             for (bit, polar) in cells.iter().enumerate() {
-                let value = polar.of(&values).copied().unwrap_or(0);
-                assert_eq!([low, high].map(|bits| bits >> bit & 1), [value & 1, value >> 1].map(u64::from));
+                let value = polar.of(&values).map(|value| usize::from(*value));
+                let with_bit: Vec<usize> = (0..4).filter(|value| bits[*value] >> bit & 1 != 0).collect();
+                assert_eq!(with_bit, Vec::from_iter(value));
             }
         }
     }

@@ -39,9 +39,8 @@ impl Steps {
     #[inline(always)]
     pub fn add_point(&mut self, cell: u32, millimetres: i16) {
         let span = &mut self.spans[cell as usize];
-        if span[0] == i16::MAX {
-            self.seen.set(cell as usize % SIDE, cell as usize / SIDE);
-        }
+        // Whether the cell has a return already cannot be predicted.
+        self.seen.set(cell as usize % SIDE, cell as usize / SIDE);
         *span = [span[0].min(millimetres), span[1].max(millimetres)];
     }
 
@@ -65,19 +64,15 @@ impl Steps {
             if high - low >= least_mm {
                 mark(cell, cell);
             }
-            for (offset, least_mm) in reaches {
+            // A cell without a return has no step to any other; few cells have a step.
+            let steps = reaches.map(|(offset, least_mm)| {
                 let other = cell.wrapping_add_signed(offset);
-                let span = self.spans[other];
-                let [other_low, other_high] = span.map(i32::from);
-                if span == EMPTY {
-                    continue;
-                }
-                if high - other_low >= least_mm {
-                    mark(cell, other);
-                }
-                if other_high - low >= least_mm {
-                    mark(other, cell);
-                }
+                let [other_low, other_high] = self.spans[other].map(i32::from);
+                (other, high - other_low >= least_mm, other_high - low >= least_mm)
+            });
+            if steps.iter().fold(false, |any, (_, down, up)| any | down | up) {
+                steps.iter().filter(|(_, down, _)| *down).for_each(|(other, ..)| mark(cell, *other));
+                steps.iter().filter(|(.., up)| *up).for_each(|(other, ..)| mark(*other, cell));
             }
         });
     }

@@ -6,7 +6,7 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, ReachConfig, SensorConfig, TerrainConfig, Variant, VehicleConfig};
 use clearway_mapping::event::{Body, Event};
 use clearway_mapping::ground::Ground;
-use clearway_mapping::layer::roughness::Roughness;
+use clearway_mapping::layer::roughness::RoughnessSums;
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_mapping::layer::{Layer, LayerMaker};
@@ -307,14 +307,13 @@ fn coarse_cell(x: f32, y: f32) -> Option<usize> {
 
 /// Roughness by [`coarse_cell`], from the points up to 2.5 m over the ground.
 fn coarse_roughness(sweep: &Sweep) -> Vec<Option<f32>> {
-    let mut roughness = Roughness::default();
-    roughness.clear(200 * 200);
+    let mut cells = vec![RoughnessSums::EMPTY; 200 * 200];
     for index in (0..sweep.x.len()).filter(|index| sweep.z[*index] < 2.5) {
         if let Some(cell) = coarse_cell(sweep.x[index], sweep.y[index]) {
-            roughness.add_points(&[cell as u32], &sweep.deviation[index..=index]);
+            cells[cell].add(sweep.deviation[index]);
         }
     }
-    (0..200 * 200).map(|cell| roughness.of_cell(cell, 4)).collect()
+    cells.iter().map(|cell| cell.roughness(4)).collect()
 }
 
 /// Mean, median and number of the roughness of the cells within a range whose points all have this label.

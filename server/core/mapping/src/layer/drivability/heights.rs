@@ -111,13 +111,13 @@ impl Heights {
 /// x, then y, so that the order of the points does not matter.
 #[inline(always)]
 fn adjust_height(cell: &mut Highest, height: f32, point: usize, sweep: &Sweep) {
-    if height > cell.height {
-        *cell = Highest { height, point: point as u32 };
-    } else if height == cell.height {
-        let held = cell.point as usize;
-        if (sweep.x[point], sweep.y[point]) > (sweep.x[held], sweep.y[held]) {
-            cell.point = point as u32;
-        }
+    let held = *cell;
+    // Which point is higher cannot be predicted; two are hardly ever equally high.
+    let new = Highest { height, point: point as u32 };
+    *cell = if height > held.height { new } else { held };
+    if height == held.height {
+        let [one, other] = [point, held.point as usize].map(|point| (sweep.x[point], sweep.y[point]));
+        cell.point = if one > other { new.point } else { held.point };
     }
 }
 

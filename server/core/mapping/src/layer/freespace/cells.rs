@@ -45,18 +45,17 @@ impl Findings<'_> {
             FreespaceClass::NotReached,
             FreespaceClass::Hidden,
         ];
-        class.clear();
-        class.resize(SIDE * SIDE, FreespaceClass::Unknown.value());
+        class.resize(SIDE * SIDE, 0);
         for (at, cells) in class.chunks_exact_mut(WORD).enumerate() {
-            let mut rest = u64::MAX;
+            let (mut rest, mut eights) = (u64::MAX, [0; WORD / 8]);
             for (plane, class) in planes.iter().zip(CLASSES) {
                 let word = plane.words()[at] & rest;
                 rest &= !word;
-                match word {
-                    0 => {}
-                    u64::MAX => cells.fill(class.value()),
-                    _ => fill(cells, word, class.value()),
-                }
+                add_class(&mut eights, word, class);
+            }
+            add_class(&mut eights, rest, FreespaceClass::Unknown);
+            for (cells, eight) in cells.chunks_exact_mut(8).zip(eights) {
+                cells.copy_from_slice(&eight.to_le_bytes());
             }
         }
     }
@@ -104,11 +103,15 @@ impl Findings<'_> {
     }
 }
 
-/// Writes a value to the cells whose bits are set.
-fn fill(cells: &mut [u8], word: u64, value: u8) {
-    for (byte, cells) in word.to_le_bytes().into_iter().zip(cells.chunks_exact_mut(8)) {
-        for (bit, cell) in cells.iter_mut().enumerate() {
-            *cell = if byte >> bit & 1 != 0 { value } else { *cell };
-        }
+/// Adds a class to the cells whose bits are set; a byte each, eight in a number, in the order of the cells.
+fn add_class(eights: &mut [u64; WORD / 8], word: u64, class: FreespaceClass) {
+    if word == 0 {
+        return;
+    }
+    for (eight, byte) in eights.iter_mut().zip(word.to_le_bytes()) {
+        // Each byte keeps its own bit, which is then moved to the lowest place.
+        let own = (u64::from(byte) * 0x0101_0101_0101_0101) & 0x8040_2010_0804_0201;
+        let bits = (own + 0x7f7f_7f7f_7f7f_7f7f) >> 7 & 0x0101_0101_0101_0101;
+        *eight |= bits * u64::from(class.value());
     }
 }

@@ -87,15 +87,15 @@ impl LowThings {
 
     /// Finds the low cells of the newest map: things, then steps.
     pub fn find(&mut self, reach: &Reach) -> [&Bits; 2] {
-        self.copy_heights(reach);
-        run_wide(Score(self));
+        run_wide(Score(self, reach.ground_spans_mm()));
         self.judge(reach);
         [&self.things, &self.steps]
     }
 
-    fn copy_heights(&mut self, reach: &Reach) {
+    #[inline(always)]
+    fn copy_heights(&mut self, spans_mm: &[[i16; 2]]) {
         for iy in 0..WINDOW {
-            let spans = &reach.ground_spans_mm()[(FIRST + iy) * SIDE + FIRST..][..WINDOW];
+            let spans = &spans_mm[(FIRST + iy) * SIDE + FIRST..][..WINDOW];
             let row = iy * WINDOW..(iy + 1) * WINDOW;
             let heights = self.top[row.clone()].iter_mut().zip(&mut self.low[row]);
             for ((top, low), &[lowest, highest]) in heights.zip(spans) {
@@ -184,11 +184,12 @@ impl LowThings {
     }
 }
 
-struct Score<'a>(&'a mut LowThings);
+struct Score<'a>(&'a mut LowThings, &'a [[i16; 2]]);
 
 impl WideLoop for Score<'_> {
     #[inline(always)]
     fn run(self) {
+        self.0.copy_heights(self.1);
         self.0.score();
     }
 }

@@ -13,12 +13,12 @@
 
 use crate::azimuth_columns::floor_to_whole;
 use crate::layer::maker::Context;
-use crate::layer::roughness::NOWHERE;
+use crate::layer::roughness::{NOWHERE, RoughnessSums};
+use crate::sensor::deviation::Deviation;
 use crate::sensor::sweep::Sweep;
 use crate::wide::{WideLoop, run_wide};
 
 use super::config::{GRADE_MAX, STEP_M_MAX, SpeedConfig};
-use super::rough_ground::RoughGround;
 
 /// Bumpiness of an obstacle.
 pub const OBSTACLE_BUMPINESS: f32 = f32::INFINITY;
@@ -45,6 +45,8 @@ struct BumpinessCell {
     points: u32,
     sum: i64,
     squares: i64,
+    /// Also of the points that lie too low for a height map.
+    roughness: RoughnessSums,
 }
 
 impl BumpinessCell {
@@ -60,8 +62,15 @@ impl BumpinessCell {
     }
 }
 
-const EMPTY: BumpinessCell =
-    BumpinessCell { highest: i16::MIN, lowest: i16::MAX, highest_over_ground: i16::MIN, points: 0, sum: 0, squares: 0 };
+const EMPTY: BumpinessCell = BumpinessCell {
+    highest: i16::MIN,
+    lowest: i16::MAX,
+    highest_over_ground: i16::MIN,
+    points: 0,
+    sum: 0,
+    squares: 0,
+    roughness: RoughnessSums::EMPTY,
+};
 
 /// Heights of a grid of `side` cells along x and y with the vehicle in the middle: index = iy * side + ix.
 #[derive(Clone, Debug, PartialEq)]
@@ -69,8 +78,9 @@ pub struct HeightMap {
     side: usize,
     cell_m: f32,
     cells: Vec<BumpinessCell>,
-    /// Indices of the cells with a point, in the order in which points fell into them.
+    /// Indices of the cells with a point, in the order in which points fell into them; of those with a roughness alone.
     seen: Vec<u32>,
+    only_rough: Vec<u32>,
     /// By cell: mean height, metres; NaN without points.
     means_m: Vec<f32>,
     bumpiness_m: Vec<f32>,
@@ -84,6 +94,7 @@ impl HeightMap {
             cell_m,
             cells: vec![EMPTY; side * side],
             seen: Vec::new(),
+            only_rough: Vec::new(),
             means_m: vec![f32::NAN; side * side],
             bumpiness_m: vec![f32::NAN; side * side],
         }
@@ -104,14 +115,14 @@ impl HeightMap {
         self.seen.iter().map(|cell| *cell as usize)
     }
 
-    /// Replaces the points by those of a sweep, here and in `rough_ground`.
-    pub fn update(
-        &mut self,
-        sweep: &Sweep,
-        context: &Context<'_>,
-        config: &SpeedConfig,
-        rough_ground: &mut RoughGround,
-    ) {
+    /// The deviations in a cell with a point.
+    pub fn roughness(&self, cell: usize) -> &RoughnessSums {
+        &self.cells[cell].roughness
+    }
+
+    /// Replaces the points by those of a sweep.
+    pub fn update(&mut self, sweep: &Sweep, context: &Context<'_>, config: &SpeedConfig) {
+        self.only_rough.drain(..).for_each(|cell| self.cells[cell as usize] = EMPTY);
         for &cell in &self.seen {
             self.cells[cell as usize] = EMPTY;
             self.means_m[cell as usize] = f32::NAN;
@@ -119,8 +130,8 @@ impl HeightMap {
         }
         self.seen.clear();
         let (mut cells, mut millimetres, mut over_ground) = ([NOWHERE; CHUNK], [0; CHUNK], [0; CHUNK]);
+        let unknown = [Deviation::UNKNOWN; CHUNK];
         let lowest_m = if context.ground.is_some() { LOWEST_M } else { LOWEST_OVER_PLANE_M };
-        rough_ground.clear(sweep, self.cells.len());
         // A sweep without deviations has an empty list.
         let mut deviations = sweep.deviation.chunks(CHUNK);
         let heights_m = context.heights_m(sweep).chunks(CHUNK);
@@ -133,18 +144,19 @@ impl HeightMap {
                 cells: &mut cells,
                 heights_mm: [&mut millimetres, &mut over_ground],
             });
-            rough_ground.add_points(&cells, deviations.next().unwrap_or_default());
-            for ((&cell, &millimetres), &over_ground) in cells.iter().zip(&millimetres).zip(&over_ground).take(xs.len())
-            {
-                if over_ground == NOT_USED {
-                    continue;
-                }
-                if let Some(sums) = self.cells.get_mut(cell as usize) {
-                    if sums.points == 0 {
-                        self.seen.push(cell);
+            let heights = millimetres.iter().zip(&over_ground).take(xs.len());
+            let points = cells.iter().zip(deviations.next().unwrap_or(&unknown)).zip(heights);
+            for ((&index, &deviation), (&millimetres, &over_ground)) in points {
+                let Some(cell) = self.cells.get_mut(index as usize) else { continue };
+                if over_ground != NOT_USED {
+                    if cell.points == 0 {
+                        self.seen.push(index);
                     }
-                    sums.add_point([millimetres as i16, over_ground as i16]);
+                    cell.add_point([millimetres as i16, over_ground as i16]);
+                } else if cell.points == 0 {
+                    self.only_rough.push(index);
                 }
+                cell.roughness.add(deviation);
             }
         }
     }
@@ -256,7 +268,7 @@ mod tests {
             let mut map = HeightMap::new(80, 0.25);
             for _ in 0..2 {
                 let sweep = Sweep { x: vec![5.1; 4], y: vec![-3.1; 4], z: heights.into(), ..Sweep::default() };
-                map.update(&sweep, &context, &config, &mut RoughGround::default());
+                map.update(&sweep, &context, &config);
                 map.judge(&context, &config);
             }
             let [cell] = map.known().collect::<Vec<_>>()[..] else { panic!("one cell is known") };

@@ -39,14 +39,12 @@ use corridor::{Corridor, OUTSIDE};
 use measured_road::MeasuredRoad;
 use painting::{NO_ROAD, Painter};
 use painting_conditions::{Condition, PaintingConditions, RoadSource};
-use rough_ground::RoughGround;
 
 /// Maker of the layer `speed`. It reuses its buffers from map to map.
 #[derive(Clone)]
 pub struct Speed {
     config: SpeedConfig,
     heights: HeightMap,
-    rough_ground: RoughGround,
     measured_road: MeasuredRoad,
     conditions: PaintingConditions,
     painter: Painter,
@@ -60,7 +58,6 @@ impl Speed {
         Self {
             config: config.clone(),
             heights: HeightMap::new(side, config.cell_m),
-            rough_ground: RoughGround::default(),
             measured_road: MeasuredRoad::default(),
             conditions: PaintingConditions::default(),
             painter: Painter::new(side, config),
@@ -158,7 +155,8 @@ impl Speed {
             }
             let limit_mps = self.corridor.limit_mps(cell);
             let on_road = bonus != NO_ROAD && (limit_mps != OUTSIDE || !self.config.corridor);
-            let ground_mps = self.off_road_mps(bumpiness, self.rough_ground.factor(cell, &self.config));
+            let ground_mps =
+                self.off_road_mps(bumpiness, rough_ground::factor(self.heights.roughness(cell), &self.config));
             let mps = self.limited_mps(ground_mps + if on_road { bonus } else { 0.0 }, limit_mps);
             class[cell] = if on_road { SpeedClass::Road.value() } else { SpeedClass::Passable.value() };
             speed[cell] = self.raw(mps);
@@ -201,7 +199,7 @@ impl LayerMaker for Speed {
     }
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
-        self.heights.update(sweep, context, &self.config, &mut self.rough_ground);
+        self.heights.update(sweep, context, &self.config);
         self.heights.judge(context, &self.config);
         self.paint(sweep, context);
         layer.geometry = self.geometry();

@@ -6,8 +6,10 @@
 //!
 //! Sums of whole numbers are exact, so that they do not depend on the order of the points.
 
-use crate::layer::roughness::{NOWHERE, Roughness};
+use crate::layer::roughness::{NOWHERE, RoughnessSums};
+use crate::sensor::deviation::Deviation;
 use crate::sensor::sweep::Sweep;
+use crate::wide::{WideLoop, run_wide};
 
 use super::division::{Division, Region, cell_of_rank};
 
@@ -75,6 +77,15 @@ impl Moments {
     }
 }
 
+/// Sums over the points of a cell, in two lines of the cache.
+#[derive(Clone, Copy, Debug)]
+struct CellSums {
+    moments: Moments,
+    roughness: RoughnessSums,
+    /// Heights of the lowest and highest point, mm.
+    span: [f32; 2],
+}
+
 /// The cells with points, in the order of the division.
 #[derive(Clone, Debug, Default)]
 pub struct Cells {
@@ -91,10 +102,8 @@ pub struct Cells {
     number_of_cell: Vec<u32>,
     /// By number of a cell: the cell.
     numbered: Vec<u32>,
-    /// By number of a cell: the sums over its points, and the heights of its lowest and highest point, mm.
-    sums_of_number: Vec<(Moments, [f32; 2])>,
-    /// By number of a cell: its roughness.
-    roughness: Roughness,
+    /// By number of a cell: the sums over its points.
+    sums_of_number: Vec<CellSums>,
     /// One bit for each cell of the grid, by rank: set if the cell has a point.
     occupied: Vec<u64>,
     /// Number of occupied cells before each word of `occupied`.
@@ -149,42 +158,13 @@ impl Cells {
     /// beyond the grid, are left out. `heights_m` are the heights of the points over the ground, metres; points at the
     /// end without a height are left out too.
     pub fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
-        self.sum_cells(sweep, heights_m, overhang_m);
+        run_wide(SumCells { cells: self, sweep, heights_m, overhang_m });
         self.number_slots();
         self.sum_slots();
     }
 
-    /// Sums the points of each cell.
-    fn sum_cells(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
-        self.numbered.drain(..).for_each(|cell| self.number_of_cell[cell as usize] = NOWHERE);
-        self.sums_of_number.clear();
-        self.roughness.clear(0);
-        let (mut cells, mut points) = ([NOWHERE; CHUNK], [[0.0; CHUNK]; 3]);
-        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
-        // A sweep without deviations has an empty list.
-        let mut deviations = sweep.deviation.chunks(CHUNK);
-        for (((xs, ys), zs), heights_m) in chunks.zip(heights_m.chunks(CHUNK)) {
-            self.find_cells([xs, ys, heights_m], overhang_m, &mut cells);
-            for (millimetres_of, metres) in points.iter_mut().zip([xs, ys, zs]) {
-                millimetres_of.iter_mut().zip(metres).for_each(|(mm, metres)| *mm = millimetres(*metres));
-            }
-            let [xs, ys, zs] = &points;
-            for i in 0..heights_m.len() {
-                let cell = cells[i];
-                let number = self.number(cell);
-                cells[i] = number;
-                if let Some((sums, [low, high])) = self.sums_of_number.get_mut(number as usize) {
-                    let z = zs[i];
-                    sums.add([xs[i], ys[i], z]);
-                    (*low, *high) = (if z < *low { z } else { *low }, if z > *high { z } else { *high });
-                }
-            }
-            let deviations = deviations.next().unwrap_or_default();
-            self.roughness.add_points(&cells, &deviations[..deviations.len().min(heights_m.len())]);
-        }
-    }
-
     /// Finds the cell of each point of a chunk. It has no branches, so that the compiler vectorises it.
+    #[inline(always)]
     fn find_cells(&self, [xs, ys, heights_m]: [&[f32]; 3], overhang_m: f32, cells: &mut [u32; CHUNK]) {
         let (scale, half) = (1.0 / self.cell_m, self.half as f32);
         let (offset, width) = (self.half, 2 * self.half as u32);
@@ -211,8 +191,8 @@ impl Cells {
         if *number == NOWHERE {
             *number = self.numbered.len() as u32;
             self.numbered.push(cell);
-            self.sums_of_number.push((Moments::default(), [f32::INFINITY, -f32::INFINITY]));
-            self.roughness.push_cell();
+            let (moments, roughness) = (Moments::default(), RoughnessSums::EMPTY);
+            self.sums_of_number.push(CellSums { moments, roughness, span: [f32::INFINITY, f32::NEG_INFINITY] });
         }
         *number
     }
@@ -244,9 +224,9 @@ impl Cells {
         self.sums.push(running);
         for rank in &self.rank_of_slot {
             let number = self.number_of_cell[self.cell_of_rank[*rank as usize] as usize] as usize;
-            let (sums, span) = &self.sums_of_number[number];
+            let CellSums { moments, span, .. } = &self.sums_of_number[number];
             self.span.push(*span);
-            running = running.plus(sums);
+            running = running.plus(moments);
             self.sums.push(running);
         }
     }
@@ -306,7 +286,46 @@ impl Cells {
 
     /// Roughness of a cell of the grid; `None` with fewer deviations than `points_min`. The cell must have a point.
     pub fn roughness(&self, cell: usize, points_min: u16) -> Option<f32> {
-        self.roughness.of_cell(self.number_of_cell[cell] as usize, points_min)
+        self.sums_of_number[self.number_of_cell[cell] as usize].roughness.roughness(points_min)
+    }
+}
+
+/// Sums the points of each cell.
+struct SumCells<'a> {
+    cells: &'a mut Cells,
+    sweep: &'a Sweep,
+    heights_m: &'a [f32],
+    overhang_m: f32,
+}
+
+impl WideLoop for SumCells<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { cells: all, sweep, heights_m, overhang_m } = self;
+        all.numbered.drain(..).for_each(|cell| all.number_of_cell[cell as usize] = NOWHERE);
+        all.sums_of_number.clear();
+        let (mut cells, mut points, unknown) = ([NOWHERE; CHUNK], [[0.0; CHUNK]; 3], [Deviation::UNKNOWN; CHUNK]);
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        // A sweep without deviations has an empty list.
+        let mut deviations = sweep.deviation.chunks(CHUNK);
+        for (((xs, ys), zs), heights_m) in chunks.zip(heights_m.chunks(CHUNK)) {
+            all.find_cells([xs, ys, heights_m], overhang_m, &mut cells);
+            for (millimetres_of, metres) in points.iter_mut().zip([xs, ys, zs]) {
+                millimetres_of.iter_mut().zip(metres).for_each(|(mm, metres)| *mm = millimetres(*metres));
+            }
+            let ([xs, ys, zs], deviations) = (&points, deviations.next().unwrap_or(&unknown));
+            let positions = xs.iter().zip(ys).zip(zs).take(heights_m.len());
+            for ((cell, ((&x, &y), &z)), deviation) in cells.iter().zip(positions).zip(deviations) {
+                let number = all.number(*cell);
+                if let Some(CellSums { moments, roughness, span: [low, high] }) =
+                    all.sums_of_number.get_mut(number as usize)
+                {
+                    moments.add([x, y, z]);
+                    roughness.add(*deviation);
+                    (*low, *high) = (if z < *low { z } else { *low }, if z > *high { z } else { *high });
+                }
+            }
+        }
     }
 }
 

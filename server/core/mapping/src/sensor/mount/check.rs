@@ -32,9 +32,9 @@ const BESIDE_M: f32 = 4.0;
 const Z_M: f32 = 1.5;
 /// The same for a scan without ground within that: the mount is wrong by more. Ours: no sensor of a vehicle is higher.
 const FAR_Z_M: f32 = 5.0;
-/// Number of points that are read of a scan, about. Ours: a third of an HDL-64E's; the cells need no more, and each map
+/// Number of points that are read of a scan, about. Ours: a ninth of an HDL-64E's; the cells need no more, and each map
 /// waits for the comparison.
-const POINTS: usize = 40_000;
+const POINTS: usize = 13_000;
 /// Side of a cell, metres.
 const CELL_M: f32 = 0.5;
 const CELLS_AHEAD: usize = (2.0 * AHEAD_M / CELL_M) as usize;
