@@ -10,6 +10,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
+use clearway_mapping::config::check_name;
 use clearway_proto::v1;
 use prost::Message;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
@@ -50,7 +51,8 @@ struct Announced {
 /// Why an announcement is not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AnnouncementRefused {
-    /// It is no [`v1::Vehicle`], is too long or takes too much memory, or its name is missing or too long.
+    /// It is no [`v1::Vehicle`], is too long or takes too much memory, its name is no vehicle's, or another text is too
+    /// long or has control characters, which would make lines of their own on a terminal.
     #[error("an announcement of another server is no vehicle, or too large a one")]
     Invalid,
     /// The vehicles that are listed take the memory.
@@ -70,7 +72,8 @@ impl Fleet {
         let bytes = bytes.ok_or(AnnouncementRefused::Invalid)?;
         let mut vehicle = v1::Vehicle::decode(announcement).map_err(|_| AnnouncementRefused::Invalid)?;
         let names = [&vehicle.name, &vehicle.server, &vehicle.grpc, &vehicle.page];
-        if vehicle.name.is_empty() || names.iter().any(|name| name.len() > NAME_BYTES_MAX) {
+        let is_wrong = |text: &String| text.len() > NAME_BYTES_MAX || text.contains(char::is_control);
+        if check_name("name", &vehicle.name).is_err() || names.into_iter().any(is_wrong) {
             return Err(AnnouncementRefused::Invalid);
         }
         if !config::Grpc::is_address(&vehicle.grpc) {
@@ -213,6 +216,8 @@ mod tests {
             vec![0; ANNOUNCEMENT_BYTES_MAX + 1],
             announcement("", 1, "a:1", 0),
             announcement(&"v".repeat(NAME_BYTES_MAX + 1), 1, "a:1", 0),
+            announcement("van\ncar: OK", 1, "a:1", 0),
+            announcement("van", 1, "a:1\n", 0),
             v1::Vehicle { name: "van".into(), ..of_empty_sensors }.encode_to_vec(),
         ] {
             assert_eq!(fleet.hear(&announcement, now), Err(AnnouncementRefused::Invalid));
@@ -225,7 +230,7 @@ mod tests {
         let (fleet, now) = (Fleet::default(), Instant::now());
         let vehicle = |n: usize| {
             let sensors = vec![v1::SensorState { name: "top".into(), ..Default::default() }; 200];
-            v1::Vehicle { name: format!("car {n}"), sensors, ..Default::default() }.encode_to_vec()
+            v1::Vehicle { name: format!("car-{n}"), sensors, ..Default::default() }.encode_to_vec()
         };
         let taken = (0..4096).take_while(|n| fleet.hear(&vehicle(*n), now).is_ok()).count();
         assert_eq!(fleet.hear(&vehicle(taken), now), Err(AnnouncementRefused::Full));

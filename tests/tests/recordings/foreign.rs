@@ -199,6 +199,13 @@ fn a_bag_that_computes_what_it_holds_is_refused_by_name() {
             format!("{table}); INSERT INTO messages VALUES (1, 1, 1, zeroblob(65 << 20))"),
             "1 message cannot be read: string or blob too big",
         ),
+        (
+            format!(
+                "{table}); WITH RECURSIVE n (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 10001)
+                INSERT INTO messages SELECT i, 1, i, NULL FROM n"
+            ),
+            "no index of their times",
+        ),
     ] {
         let file = tempfile::NamedTempFile::new().unwrap();
         Connection::open(file.path()).unwrap().execute_batch(&format!("{topics} {messages}")).unwrap();

@@ -17,15 +17,23 @@ use super::damage::LostPart;
 use crate::counted::counted;
 
 /// Number of messages that are read at once. Ours: a message of points has about a megabyte.
-const BATCH: i64 = 16;
+const BATCH: i64 = 1024;
+/// Number of messages that are read at once without an index of the times: SQLite keeps them all while it sorts.
+const BATCH_UNSORTED: i64 = 16;
+/// Most messages of a bag without an index of the times, which is read whole for each batch. Ours: rosbag2 and every
+/// library that writes bags makes the index.
+const UNSORTED_MAX: i64 = 10_000;
 /// Number of bytes of messages after which no more are read at once.
 const BATCH_BYTES: usize = 16 << 20;
-/// Most steps of a query in SQLite's machine. Ours: the sixteen messages of a batch take 500, and with an index of the
-/// times each query does; without it, 10 for each message of the bag.
+/// Most steps of a query in SQLite's machine. Ours: with an index of the times a batch takes 30 for each message of the
+/// batch; without it, 10 for each message of the bag.
 const QUERY_STEPS_MAX: i32 = 1_000_000_000;
 /// The first of the two tables that is a view, of a module, or has columns that are computed when they are read.
 const NOT_PLAIN: &str = "SELECT name FROM pragma_table_list AS listed WHERE lower(name) IN ('topics', 'messages') AND \
     (type <> 'table' OR EXISTS (SELECT 1 FROM pragma_table_xinfo(listed.name) WHERE hidden > 0))";
+/// True if no index begins with the times.
+const NOT_SORTED: &str = "SELECT NOT EXISTS (SELECT 1 FROM pragma_index_list('messages') AS listed, \
+    pragma_index_info(listed.name) AS info WHERE NOT partial AND seqno = 0 AND lower(info.name) = 'timestamp')";
 /// First bytes of a message that rosbag2 has compressed with zstd. No message in CDR starts with them.
 const ZSTD: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
 
@@ -35,6 +43,8 @@ pub(super) struct BagRecords {
     /// Holds the copy that is read; removed after the connection.
     _copy: Option<TempDir>,
     waiting: VecDeque<Record<'static>>,
+    /// Number of messages that are read at once.
+    batch: i64,
     /// Time and id of the newest message.
     newest: (i64, i64),
     bytes_read: u64,
@@ -70,6 +80,14 @@ impl BagRecords {
         if let Some(name) = bag.query_row(NOT_PLAIN, [], |row| row.get::<_, String>(0)).optional()? {
             return Err(refused(format!("{name:?} is no plain table")));
         }
+        let is_unsorted: bool = bag.query_row(NOT_SORTED, [], |row| row.get(0))?;
+        let greatest =
+            || bag.query_row("SELECT max(rowid) FROM messages", [], |row| row.get::<_, Option<i64>>(0)).ok()?;
+        if is_unsorted && greatest().is_some_and(|greatest| greatest > UNSORTED_MAX) {
+            let advice = "sqlite3 BAG 'CREATE INDEX timestamp_idx ON messages (timestamp)' makes it, as rosbag2 does";
+            let what = "its messages have no index of their times";
+            return Err(refused(format!("{what}, and it has more than {UNSORTED_MAX} messages: {advice}")));
+        }
         let mut waiting = VecDeque::new();
         let mut topics = bag.prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")?;
         let mut rows = topics.query([])?;
@@ -86,8 +104,19 @@ impl BagRecords {
         drop(rows);
         drop(topics);
         let newest = (i64::MIN, i64::MIN);
+        let batch = if is_unsorted { BATCH_UNSORTED } else { BATCH };
         let (bytes_read, decompressed) = (0, 0);
-        Ok(Self { bag, _copy: copy, waiting, newest, bytes_read, decompressed, has_ended: false, lost: Vec::new() })
+        Ok(Self {
+            bag,
+            _copy: copy,
+            waiting,
+            batch,
+            newest,
+            bytes_read,
+            decompressed,
+            has_ended: false,
+            lost: Vec::new(),
+        })
     }
 
     /// Number of bytes of the messages so far.
@@ -135,7 +164,7 @@ impl BagRecords {
             "SELECT id, topic_id, timestamp, data FROM messages WHERE (timestamp, id) > (?1, ?2) \
              ORDER BY timestamp, id LIMIT ?3",
         )?;
-        let mut rows = messages.query(params![self.newest.0, self.newest.1, BATCH])?;
+        let mut rows = messages.query(params![self.newest.0, self.newest.1, self.batch])?;
         self.has_ended = true;
         let mut bytes = 0;
         while bytes < BATCH_BYTES

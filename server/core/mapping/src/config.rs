@@ -23,8 +23,6 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::clock::AHEAD_NS_MAX;
 use serde::{Deserialize, Serialize};
 
-use crate::value_check::check_name;
-
 pub use crate::fusion::config::FusionConfig;
 pub use crate::ground::config::{GroundConfig, Variant as GroundVariant};
 pub use crate::layer::drivability::config::{DrivabilityConfig, DrivabilityVariant, Passage, PlaneTest, Seed};
@@ -40,7 +38,7 @@ pub use crate::reach::config::ReachConfig;
 pub use crate::sensor::config::{BLIND_MAX, Extrinsics, RINGS_MAX, SensorConfig};
 pub use crate::sensor::motion::MotionConfig;
 pub use crate::sensor::self_filter::BodyConfig;
-pub use crate::value_check::ConfigValueError;
+pub use crate::value_check::{ConfigValueError, check_name};
 
 /// Greatest number of sensors of one vehicle, declared ones included. Ours: the newest scan of each takes some
 /// megabytes.

@@ -86,7 +86,7 @@ pub(crate) fn check_columns(at: &str, columns: u16) -> Result<(), ConfigValueErr
 ///
 /// # Errors
 /// [`ConfigValueError`] if it is not 1 to 64 of the characters a-z, 0-9, - and _.
-pub(crate) fn check_name(key: &str, name: &str) -> Result<(), ConfigValueError> {
+pub fn check_name(key: &str, name: &str) -> Result<(), ConfigValueError> {
     let is_allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-' || c == '_';
     if !name.is_empty() && name.len() <= 64 && name.chars().all(is_allowed) {
         Ok(())

@@ -39,7 +39,7 @@ pub struct Setup {
 }
 
 /// What to do about a port that another program has.
-const IN_USE: &str = ": another program has the port, perhaps another clearway; `--set grpc.listen=127.0.0.1:50052` names \
+const IN_USE: &str = ": another program has the port, perhaps another clearway; `--set` with this key names \
     another one, and `--any-port` of `replay --serve` and `demo` takes free ones";
 
 /// A server did not start.
