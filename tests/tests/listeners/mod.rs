@@ -53,6 +53,17 @@ async fn metric(running: &Running, line: &str) -> f64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_call_for_a_vehicle_that_the_server_does_not_have_is_counted() {
+    let running = start(everything()).await;
+    let request = v1::GetMapRequest { vehicle: "truck".into(), ..Default::default() };
+    let refused = grpc(&running).await.get_map(request).await.unwrap_err();
+    assert_eq!(refused.code(), tonic::Code::NotFound);
+    let calls = "clearway_connections_closed_total{listener=\"grpc\",reason=\"unknown_vehicle\"}";
+    assert_eq!(metric(&running, calls).await, 1.0);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn connections_that_do_nothing_keep_no_newcomer_out() {
     let mut config = everything();
     config.connections.max = 32;

@@ -75,6 +75,33 @@ fn words_of_the_glossary_replace_home_made_ones() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
+/// Files whose functions `reason` name why datagrams, scans and messages are refused. Poses and roads have their own
+/// counts.
+const REASONS: [&str; 4] = [
+    "server/core/lidar/src/datagram/error.rs",
+    "server/core/mapping/src/error.rs",
+    "server/daemon/src/ingest/observation.rs",
+    "server/daemon/src/ingest/ros/decoder.rs",
+];
+
+#[test]
+fn every_reason_of_a_refusal_has_a_series_before_it_occurs() {
+    let text = |file: &str| fs::read_to_string(workspace().join(file)).expect("UTF-8");
+    let listed = text("server/daemon/src/status/reasons.rs");
+    let mut missing = Vec::new();
+    for file in REASONS {
+        let source = text(file);
+        let (_, function) = source.split_once("pub fn reason(&self) -> &'static str {").expect("the function");
+        let (arms, _) = function.split_once("\n    }\n").expect("its end");
+        let reasons = arms.split('"').skip(1).step_by(2).filter(|reason| *reason != "pose");
+        let of_file: Vec<_> = reasons.collect();
+        assert!(!of_file.is_empty(), "{file} names reasons");
+        missing
+            .extend(of_file.into_iter().filter(|reason| !listed.contains(&format!("\"{reason}\""))).map(str::to_owned));
+    }
+    assert!(missing.is_empty(), "status/reasons.rs lacks {missing:?}");
+}
+
 /// The circles that are left; this list may only shrink.
 const CIRCLES: [&str; 1] =
     ["server/core/mapping/src: road <-> road::check <-> road::rddf <-> road::rndf <-> road::store"];

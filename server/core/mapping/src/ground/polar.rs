@@ -80,8 +80,8 @@ impl PolarCells {
         Self { azimuths, outline, cells: vec![EMPTY; CELLS], coordinates: Default::default() }
     }
 
-    /// Replaces the returns by those of a sweep. A return far above or below the plane under the vehicle (a gradient of
-    /// 30 % and 1.5 m) cannot be ground and is left out, and so are the returns of the vehicle itself.
+    /// Replaces the returns by the returns of a sweep. A return far above or below the plane under the vehicle (a
+    /// gradient of 30 % and 1.5 m) cannot be ground and is left out, and so are the returns of the vehicle itself.
     pub fn sort_points(&mut self, sweep: &Sweep) {
         self.cells.fill(EMPTY);
         self.coordinates.iter_mut().for_each(|axis| axis.resize(sweep.x.len(), 0.0));
@@ -236,7 +236,7 @@ pub fn beside(column: usize, beside: isize) -> usize {
     (column + COLUMNS).wrapping_add_signed(beside) % COLUMNS
 }
 
-/// Marks the cells that are marked in `marked` or share a side or a corner with one that is, and no others.
+/// Marks each cell of `marked` and its eight neighbours, and no other cell.
 pub fn mark_around(marked: &[bool], around: &mut [bool]) {
     for (row, around) in around.chunks_exact_mut(COLUMNS).enumerate() {
         let (mut in_column, rows) = ([false; COLUMNS], row.saturating_sub(1) * COLUMNS..(row + 2).min(ROWS) * COLUMNS);

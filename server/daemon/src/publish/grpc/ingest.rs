@@ -22,7 +22,7 @@ use crate::ingest::admission::{AdmissionPermit, OpenStream};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 use crate::publish::listen::CallPermit;
-use crate::publish::listen::access::Caller;
+use crate::publish::listen::access::caller;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 
@@ -55,7 +55,7 @@ impl IngestService for GrpcIngest {
         &self,
         request: Request<Streaming<v1::Observation>>,
     ) -> Result<Response<Self::StreamStream>, Status> {
-        let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
+        let caller = caller(&request);
         let slot = request.extensions().get::<Arc<CallPermit>>().map(|call| call.slot.clone());
         let host = slot.as_ref().map_or(Ipv4Addr::UNSPECIFIED.into(), |slot| slot.address());
         let full = |of: &str, error| {

@@ -254,6 +254,15 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_refused_call_is_counted_under_one_word_and_an_answered_call_under_none() {
+        let word = |status: Status| refusal(&status.into_http::<()>());
+        assert_eq!(word(Status::permission_denied("vehicle van")), Some("denied"));
+        assert_eq!(word(Status::not_found("truck")), Some("unknown_vehicle"));
+        assert_eq!(word(Status::deadline_exceeded("no selection")), Some("no_request"));
+        assert_eq!(refusal(&Response::new(())), None);
+    }
+
+    #[test]
     fn the_list_of_rpcs_is_that_of_the_wire_contract() {
         let mut rpcs = BTreeSet::new();
         let sets = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET];

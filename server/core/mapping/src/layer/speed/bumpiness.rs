@@ -120,7 +120,7 @@ impl HeightMap {
         &self.cells[cell].roughness
     }
 
-    /// Replaces the points by those of a sweep.
+    /// Replaces the points by the points of a sweep.
     pub fn update(&mut self, sweep: &Sweep, context: &Context<'_>, config: &SpeedConfig) {
         self.only_rough.drain(..).for_each(|cell| self.cells[cell as usize] = EMPTY);
         for &cell in &self.seen {
