@@ -26,6 +26,8 @@ enum Device {
     Free,
     /// It shows the same time in each packet.
     Stands,
+    /// It shows another minute after every seventh packet.
+    Random,
 }
 
 /// What the clocks do for some seconds.
@@ -50,7 +52,8 @@ fn step() -> impl Strategy<Value = i64> {
 
 fn device() -> impl Strategy<Value = Device> {
     let set = (-600_000_000..600_000_000_i64).prop_map(Device::Utc);
-    prop_oneof![3 => Just(Device::Utc(0)), 1 => set, 2 => Just(Device::Free), 1 => Just(Device::Stands)]
+    let standing = prop_oneof![Just(Device::Stands), Just(Device::Random)];
+    prop_oneof![3 => Just(Device::Utc(0)), 1 => set, 2 => Just(Device::Free), 1 => standing]
 }
 
 fn span(lasts_s: std::ops::Range<i64>) -> impl Strategy<Value = Span> {
@@ -76,8 +79,8 @@ fn sentence(utc_ns: i64, is_valid: bool) -> String {
     rmc(second.rem_euclid(86_400), if is_valid { 'A' } else { 'V' }, &format!("{day:02}0533"))
 }
 
-/// A revolution, and its age by the host's clock when it is complete.
-fn play(spans: &[Span]) -> Vec<(clearway_lidar::Revolution, i64)> {
+/// A revolution, the true time when it is complete, ns, and its age by the host's clock then.
+fn play(spans: &[Span]) -> Vec<(clearway_lidar::Revolution, i64, i64)> {
     let stream = Stream::of(Model::Vlp16);
     let period = i64::from(Model::Vlp16.spec().packet_period_ns(stream.mode));
     let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Vlp16), ..SensorConfig::default() });
@@ -95,6 +98,7 @@ fn play(spans: &[Span]) -> Vec<(clearway_lidar::Revolution, i64)> {
                 Device::Utc(ahead_ns) => NOON + t + ahead_ns,
                 Device::Free => FREE(t),
                 Device::Stands => FREE(begin),
+                Device::Random => NOON + index as i64 / 7 * 2_654_435_761 % 3_600 * S,
             };
             let device_us = (device_ns / 1_000 % 3_600_000_000) as u32;
             if t >= telemetry_ns
@@ -108,7 +112,7 @@ fn play(spans: &[Span]) -> Vec<(clearway_lidar::Revolution, i64)> {
             let packet = with_device_us(stream.packet(index), device_us);
             if let Some(revolution) = push(&mut sensor, &packet, host(t + period)).cloned() {
                 let age_ns = host(t + period) - revolution.end_ns;
-                revolutions.push((revolution, age_ns));
+                revolutions.push((revolution, t, age_ns));
             }
         }
         host_ns += span.lasts_ns / 1_000_000 * span.host_ppm;
@@ -128,18 +132,18 @@ proptest! {
         let last = Span { host_ppm: last.host_ppm / 20, ..last };
         let spans: Vec<_> = before.iter().cloned().chain([last.clone()]).collect();
         let revolutions = play(&spans);
+        prop_assume!(last.device != Device::Random);
         let wrong_ns: i64 = before.iter().map(|span| span.lasts_ns).sum();
         let vouches = |span: &Span| span.gps_ahead_ns.is_some() && span.is_valid && span.lasts_ns >= S;
         let has_gps = spans.iter().any(vouches);
         for pair in revolutions.windows(2) {
-            let [(before, _), (next, _)] = pair else { continue };
+            let [(before, ..), (next, ..)] = pair else { continue };
             let epochs = before.epoch + u32::from(before.end_ns >= next.start_ns);
             prop_assert_eq!(next.epoch, epochs, "revolution {}: {:#?}", next.sequence, spans);
         }
-        // Revolutions have a tenth of a second.
-        let healed = ((wrong_ns + HEALED) / REVOLUTION) as usize;
-        prop_assert!(revolutions.len() > healed + 20, "{} revolutions", revolutions.len());
-        for (revolution, age_ns) in &revolutions[healed..] {
+        let healed: Vec<_> = revolutions.iter().filter(|(_, t, _)| *t > wrong_ns + HEALED).collect();
+        prop_assert!(healed.len() > 20, "{} revolutions", healed.len());
+        for (revolution, _, age_ns) in healed {
             let is_gps = matches!(revolution.clock, Clock::Gps | Clock::GpsUnlocked);
             // The offset is in the status of the server, which says which clock contradicts the other.
             let is_told = (age_ns / 1_000_000 - revolution.clock_offset_ms).abs() < 150;

@@ -248,8 +248,9 @@ impl Motion {
     }
 
     /// How far the clock of the poses has stepped ahead of the clock of the scan that is being made, ns; `None` if the
-    /// two agree.
+    /// two agree, or without poses.
     pub(super) fn ahead_of_scan_ns(&self) -> Option<i64> {
+        self.newest_pose()?;
         let pose_step_ns = self.pose_clock.step_ns();
         (!agree(pose_step_ns, self.scan_step_ns)).then(|| pose_step_ns.saturating_sub(self.scan_step_ns))
     }
