@@ -14,7 +14,7 @@ use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::picture_options::PictureOptions;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::files;
-use crate::cli::shared::output::{block_on, print_line, usage_error};
+use crate::cli::shared::output::{age_text, block_on, print_line, usage_error};
 
 /// Interval at which a server is asked again. Ours: a tenth of a second is a revolution.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
@@ -122,8 +122,9 @@ async fn get(options: &GetArguments, format: Option<Format>) -> Result<Exit> {
         .to_string()
     } else {
         let said = if stale { ", STALE" } else { "" };
+        let age = age_text(age_ms);
         let (vehicle, sequence, name) = (map.vehicle(), map.sequence(), &layer.name);
-        format!("{vehicle} #{sequence:06}: {name}, {age_ms:.0} ms old{said}, written to {}", file.display())
+        format!("{vehicle} #{sequence:06}: {name}, {age}{said}, written to {}", file.display())
     })?;
     Ok(Exit::from_stale(stale))
 }

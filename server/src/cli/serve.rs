@@ -6,7 +6,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use crate::cli::service_manager;
 use crate::cli::shared::configuration::ConfigurationOptions;
-use crate::cli::shared::output::{block_on, stop_signal};
+use crate::cli::shared::output::{block_on, stop_signal, with_causes};
 use clearway_daemon::base::held_sockets::HeldSockets;
 use clearway_daemon::config::Config;
 use clearway_daemon::run::{Running, Server, Setup, ShutdownError};
@@ -56,10 +56,10 @@ async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) 
             () = service_manager::report_life(&running) => {}
             _ = hangups.recv() => {
                 let reloaded = reload(&running, configuration, &config);
-                running.note_reload(reloaded.as_ref().err().map(|error| format!("{error:#}")));
+                running.note_reload(reloaded.as_ref().err().map(with_causes));
                 match reloaded {
                     Ok(()) => tracing::info!("certificates, tokens, roles and limits are read again"),
-                    Err(error) => tracing::error!("nothing is changed: {error:#}"),
+                    Err(error) => tracing::error!("nothing is changed: {}", with_causes(&error)),
                 }
             }
         }

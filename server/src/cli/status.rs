@@ -6,7 +6,7 @@ use clearway_client::v1;
 
 use crate::cli::connection::{ServerOptions, explain};
 use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, print_line};
+use crate::cli::shared::output::{age_text, block_on, print_line};
 use clearway_daemon::status::{State, vehicle_json};
 
 /// Print the state of each vehicle: ok, or what is wrong with it.
@@ -68,7 +68,7 @@ fn exit<'a>(states: impl Iterator<Item = &'a str>) -> Exit {
 
 /// A line for the vehicle, and one for each reason.
 fn lines(vehicle: &v1::Vehicle) -> Vec<String> {
-    let age = vehicle.map_age_ms.map_or("no map".to_owned(), |age| format!("newest map {age:.0} ms old"));
+    let age = vehicle.map_age_ms.map_or("no map".to_owned(), |age| format!("newest map {}", age_text(age)));
     let total = vehicle.latency_ms.get("total").map_or(String::new(), |ms| format!(", latency {ms:.0} ms"));
     let share = vehicle.drivable_share.map_or(String::new(), |share| format!(", {:.0} % drivable", 100.0 * share));
     let pose = vehicle.pose.as_ref().map_or(String::new(), |pose| {

@@ -8,7 +8,7 @@ use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
 use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::shared::output::{block_on, counted, print_line};
+use crate::cli::shared::output::{age_text, block_on, counted, print_line};
 use clearway_daemon::status::{run_text, vehicle_json};
 
 /// List the vehicles of a server and of those it knows: maps, sensors, losses, readers, recording.
@@ -83,7 +83,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
 
 /// The lines for one vehicle, with its server if there are several.
 fn lines(vehicle: &v1::Vehicle, is_fleet: bool, now: i64) -> Vec<String> {
-    let age = age_ms(vehicle, now).map_or("none yet".to_owned(), |age| format!("newest {age:.0} ms old"));
+    let age = age_ms(vehicle, now).map_or("none yet".to_owned(), |age| format!("newest {}", age_text(age)));
     let server = if is_fleet { format!(" on {}", server_text(vehicle)) } else { String::new() };
     let mut lines = vec![format!(
         "{}{server}: {}, {age}; layers {}",

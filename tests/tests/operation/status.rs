@@ -293,19 +293,23 @@ async fn a_configuration_that_is_refused_at_sighup_is_in_status_and_metrics_unti
         let metrics = ask(page, "/metrics").await.1;
         assert!(metrics.contains(&format!("\nclearway_config_last_reload_successful {expected}\n")), "{metrics}");
     };
-    let reasons = async || {
+    let reasons = async |what: &str| {
         let text = ask(page, "/vehicles").await.1;
-        text.contains("was not read again at the newest SIGHUP") && text.contains("rolls")
+        assert!(text.matches("TOML parse error").count() <= 1, "a cause stands twice: {text}");
+        text.contains("was not read again at the newest SIGHUP") && text.contains(what)
     };
     is_successful(1).await;
     reload(&format!("rolls = 3\n{}", config.to_toml()));
     line_with("nothing is changed").await;
     is_successful(0).await;
-    assert!(reasons().await);
+    assert!(reasons("rolls").await);
+    reload("rolls = = 3");
+    line_with("nothing is changed").await;
+    assert!(reasons("TOML parse error").await);
     reload(&config.to_toml());
     line_with("are read again").await;
     is_successful(1).await;
-    assert!(!reasons().await);
+    assert!(!reasons("").await);
     server.kill().unwrap();
     server.wait().unwrap();
     reading.join().unwrap();

@@ -38,9 +38,12 @@ pub struct Setup {
     pub replay: Option<ReplayHandle>,
 }
 
-/// What to do about a port that another program has.
-const IN_USE: &str = ": another program has the port, perhaps another clearway; `--set` with this key names \
-    another one, and `--any-port` of `replay --serve` and `demo` takes free ones";
+/// What to do about a port that another program has; nothing if none has.
+fn in_use(is_in_use: bool) -> &'static str {
+    let advice = ": another program has the port, perhaps another clearway; `--set` with this key names another one, \
+                  and `--any-port` of `replay --serve` and `demo` takes free ones";
+    if is_in_use { advice } else { "" }
+}
 
 /// A server did not start.
 #[derive(Debug, thiserror::Error)]
@@ -52,7 +55,7 @@ pub enum StartError {
     #[error(transparent)]
     Record(#[from] RecordError),
     /// Addresses cannot be listened on.
-    #[error("{}{}", .refused.join("; "), if *.is_in_use { IN_USE } else { "" })]
+    #[error("{}{}", .refused.join("; "), in_use(*.is_in_use))]
     Listen {
         /// The key of each address, the address, and the system's reason.
         refused: Vec<String>,
@@ -63,7 +66,7 @@ pub enum StartError {
     #[error("grpc.tls: {0}; a PEM certificate (chain), its PEM private key and PEM CA certificates are allowed")]
     Certificates(String),
     /// A vehicle's sockets cannot be bound.
-    #[error("vehicle {vehicle}: {source}")]
+    #[error("vehicle {vehicle}: {source}{}", in_use(source.source.kind() == std::io::ErrorKind::AddrInUse))]
     Udp {
         /// Name of the vehicle.
         vehicle: Arc<str>,
@@ -129,6 +132,15 @@ pub(super) fn comment_lines(comments: &[String]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_udp_port_that_another_program_has_is_named_with_its_table_and_what_to_do() {
+        let source = std::io::ErrorKind::AddrInUse.into();
+        let source = udp::BindError { vehicle: 0, at: "127.0.0.1:2368".parse().unwrap(), source };
+        let text = StartError::Udp { vehicle: "car".into(), source }.to_string();
+        assert!(text.starts_with("vehicle car: [vehicle.udp] 127.0.0.1:2368: "), "{text}");
+        assert!(text.contains("another program has the port"), "{text}");
+    }
 
     #[test]
     fn a_comment_that_quotes_line_breaks_stays_one_comment() {

@@ -27,6 +27,11 @@ pub fn with_causes(error: &Error) -> String {
     text
 }
 
+/// The age of a map, ms, for people; the age of a map of the future is negative.
+pub fn age_text(age_ms: f64) -> String {
+    if age_ms < 0.0 { format!("{:.0} ms ahead of the clock", -age_ms) } else { format!("{age_ms:.0} ms old") }
+}
+
 /// The text without the control characters that would command a terminal; a file may have brought them.
 pub fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() && !matches!(c, '\n' | '\t') { '\u{fffd}' } else { c }).collect()

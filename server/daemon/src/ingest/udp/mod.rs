@@ -39,7 +39,7 @@ pub struct Sockets(Vec<(Socket, SocketAddr, Listener)>);
 
 /// A socket cannot be bound.
 #[derive(Debug, thiserror::Error)]
-#[error("udp {at}: {source}")]
+#[error("[vehicle.udp] {at}: {source}")]
 pub struct BindError {
     /// Index of the first vehicle that is configured with the socket.
     pub vehicle: usize,

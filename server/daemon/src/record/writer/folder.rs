@@ -108,9 +108,13 @@ impl Folder {
     /// The folder of the configured file. It creates missing folders.
     ///
     /// # Errors
-    /// [`io::Error`] if the file exists and must not be replaced, or if its folder cannot be created.
+    /// [`io::Error`] if the file is a folder, exists and must not be replaced, or if its folder cannot be created.
     pub fn open(options: &Options) -> io::Result<Self> {
         let mut folder = Self::of(options);
+        if folder.file.is_dir() {
+            let allowed = "this is a folder; a file is allowed, such as drive.mcap in it";
+            return Err(io::Error::new(ErrorKind::IsADirectory, allowed));
+        }
         if options.is_numbered {
             folder.file = next_free_name(&folder.file);
         }

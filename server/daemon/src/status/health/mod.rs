@@ -366,8 +366,9 @@ fn sensor_findings(sensor: &SensorFacts, validity: Duration, add: &mut impl FnMu
     }
     // Beyond half of it maps may be stale when they are made, or of the future.
     if !validity.is_zero() && u128::from(sensor.clock_offset_ms.unsigned_abs()) > validity.as_millis() / 2 {
-        let offset_s = sensor.clock_offset_ms as f64 / 1e3;
-        add(State::Warn, format!("the host's clock is {offset_s:+.1} s ahead of that of {name}"));
+        let offset_s = sensor.clock_offset_ms.unsigned_abs() as f64 / 1e3;
+        let way = if sensor.clock_offset_ms < 0 { "behind" } else { "ahead of" };
+        add(State::Warn, format!("the host's clock is {offset_s:.1} s {way} the clock of {name}"));
     }
 }
 

@@ -80,8 +80,8 @@ fn each_thing_that_is_wrong_has_its_words() {
             "top sends 181 instead of 76 packets a revolution, more than its model: check `model` of the sensor",
             |f| f.sensors[0].packets = Some([181, 76]),
         ),
-        ("warn", "the host's clock is +0.9 s ahead of that of top", |f| f.sensors[0].clock_offset_ms = 900),
-        ("warn", "the host's clock is -0.2 s ahead of that of top", |f| f.sensors[0].clock_offset_ms = -200),
+        ("warn", "the host's clock is 0.9 s ahead of the clock of top", |f| f.sensors[0].clock_offset_ms = 900),
+        ("warn", "the host's clock is 0.2 s behind the clock of top", |f| f.sensors[0].clock_offset_ms = -200),
         ("warn", "the clock of top is holdover", |f| f.sensors[0].clock = "holdover".into()),
         ("warn", "4.2 % of the packets of the last 10 s were lost or refused", |f| f.loss = Some(0.042)),
         ("warn", "1 part not yet in the store: no", |f| {

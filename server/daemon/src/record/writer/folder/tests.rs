@@ -22,6 +22,7 @@ fn a_new_run_never_overwrites_an_earlier_recording() {
     fs::rename(temporary.path().join("car-1.mcap"), temporary.path().join("car.part-0007.mcap")).unwrap();
     assert_eq!(next_free_name(&file), temporary.path().join("car-1.mcap"));
     assert_eq!(folder(&file, false).unwrap_err().kind(), ErrorKind::AlreadyExists);
+    assert_eq!(folder(temporary.path(), false).unwrap_err().kind(), ErrorKind::IsADirectory);
 }
 
 #[test]
