@@ -36,9 +36,17 @@ const NAME_BYTES_MAX: usize = 256;
 /// Time by which the newest map of another server may be ahead of this host's clock, in ns. Ours: two clocks of hosts.
 const AHEAD_NS_MAX: i64 = 1_000_000_000;
 
-/// The vehicles of other servers, by name of the vehicle and run of its server. Clones share them. Empty without zenoh.
+/// The vehicles of other servers. Clones share them. Empty without zenoh.
 #[derive(Clone, Debug, Default)]
-pub struct Fleet(Arc<Mutex<BTreeMap<(String, u64), Announced>>>);
+pub struct Fleet(Arc<Mutex<Heard>>);
+
+#[derive(Debug, Default)]
+struct Heard {
+    /// By name of the vehicle and run of its server.
+    vehicles: BTreeMap<(String, u64), Announced>,
+    /// Number of refused announcements, by [`AnnouncementRefused::reason`].
+    refused: BTreeMap<&'static str, u64>,
+}
 
 #[derive(Debug)]
 struct Announced {
@@ -60,13 +68,36 @@ pub enum AnnouncementRefused {
     Full,
 }
 
+impl AnnouncementRefused {
+    /// The reason in metrics.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Invalid => "invalid",
+            Self::Full => "full",
+        }
+    }
+}
+
 impl Fleet {
-    /// Takes an announcement, an encoded [`v1::Vehicle`], at the time `now`. An address or URL that the configuration
-    /// would refuse is left out of it, and so is a newest map that lies in the future.
+    /// Takes an announcement, an encoded [`v1::Vehicle`], at the time `now`, or counts it as refused. An address or URL
+    /// that the configuration would refuse is left out of it, and so is a newest map that lies in the future.
     ///
     /// # Errors
     /// Why it is not taken.
     pub fn hear(&self, announcement: &[u8], now: Instant) -> Result<(), AnnouncementRefused> {
+        let taken = self.take(announcement, now);
+        if let Err(refused) = taken {
+            *locked(&self.0).refused.entry(refused.reason()).or_default() += 1;
+        }
+        taken
+    }
+
+    /// Number of refused announcements, by [`AnnouncementRefused::reason`].
+    pub fn refused(&self) -> BTreeMap<&'static str, u64> {
+        locked(&self.0).refused.clone()
+    }
+
+    fn take(&self, announcement: &[u8], now: Instant) -> Result<(), AnnouncementRefused> {
         let bytes = Some(announcement).filter(|of| of.len() <= ANNOUNCEMENT_BYTES_MAX);
         let bytes = bytes.and_then(|of| decoded_bytes(of, 0)).filter(|bytes| *bytes <= VEHICLE_BYTES_MAX);
         let bytes = bytes.ok_or(AnnouncementRefused::Invalid)?;
@@ -86,7 +117,7 @@ impl Fleet {
             vehicle.newest_capture_end_ns = 0;
         }
         let key = (vehicle.name.clone(), vehicle.boot_id);
-        let mut vehicles = self.heard(now);
+        let vehicles = &mut self.heard(now).vehicles;
         let others: usize = vehicles.iter().filter(|(other, _)| **other != key).map(|(_, of)| of.bytes).sum();
         if others + bytes > BYTES_MAX {
             return Err(AnnouncementRefused::Full);
@@ -98,7 +129,7 @@ impl Fleet {
     /// The vehicles of other servers at the time `now`, by name. A name that several servers claim is there several
     /// times.
     pub fn vehicles(&self, now: Instant) -> Vec<v1::Vehicle> {
-        self.heard(now).values().map(|announced| announced.vehicle.clone()).collect()
+        self.heard(now).vehicles.values().map(|announced| announced.vehicle.clone()).collect()
     }
 
     /// A vehicle of another server by its name at the time `now`. If several servers claim it, the newest map of the
@@ -118,10 +149,10 @@ impl Fleet {
     }
 
     /// The vehicles whose servers are not silent at the time `now`.
-    fn heard(&self, now: Instant) -> MutexGuard<'_, BTreeMap<(String, u64), Announced>> {
-        let mut vehicles = locked(&self.0);
-        vehicles.retain(|_, announced| now.saturating_duration_since(announced.heard) <= SILENT_MAX);
-        vehicles
+    fn heard(&self, now: Instant) -> MutexGuard<'_, Heard> {
+        let mut heard = locked(&self.0);
+        heard.vehicles.retain(|_, announced| now.saturating_duration_since(announced.heard) <= SILENT_MAX);
+        heard
     }
 }
 
@@ -222,6 +253,7 @@ mod tests {
         ] {
             assert_eq!(fleet.hear(&announcement, now), Err(AnnouncementRefused::Invalid));
         }
+        assert_eq!(fleet.refused(), BTreeMap::from([("invalid", 7)]));
         assert_eq!(fleet.vehicles(now), []);
     }
 
@@ -247,6 +279,6 @@ mod tests {
         fleet.hear(&announcement("van", 1, "a:1", 0), heard).unwrap();
         // It begins at once.
         tokio::time::timeout(Duration::ZERO, fleet.clone().forget_silent()).await.unwrap_err();
-        assert!(locked(&fleet.0).is_empty());
+        assert!(locked(&fleet.0).vehicles.is_empty());
     }
 }

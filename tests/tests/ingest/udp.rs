@@ -127,7 +127,7 @@ async fn every_datagram_is_counted_in_the_ledger_and_in_the_recording() {
     assert_eq!((sensors[0].ledger.decoded, sensors[0].ledger.telemetry), (packets.len() as u64, 1));
     assert_eq!(sensors[0].ledger.refused, [("block_flag", 3), ("length", 15)].into());
     assert_eq!((sensors[1].ledger.received, sensors[1].ledger.decoded, sensors[1].ledger.refused["length"]), (6, 1, 3));
-    let metrics = prometheus(std::slice::from_ref(&status), &[]);
+    let metrics = prometheus(std::slice::from_ref(&status), &[], &Default::default());
     let line = "clearway_sensor_refused_total{vehicle=\"car\",sensor=\"side\",reason=\"length\"} 3\n";
     assert!(metrics.contains(line), "{metrics}");
     let unknown_senders = status.to_proto().unknown_senders;

@@ -173,7 +173,7 @@ async fn metrics(State(shown): State<Shown>, Extension(caller): Extension<Caller
     let mut statuses = shown.vehicles.statuses();
     statuses.retain(|status| caller.may_reach(&status.name));
     let listeners: Vec<_> = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
-    ([(header::CONTENT_TYPE, CONTENT_TYPE)], prometheus(&statuses, &listeners))
+    ([(header::CONTENT_TYPE, CONTENT_TYPE)], prometheus(&statuses, &listeners, &shown.fleet))
 }
 
 /// The WebSocket of all vehicles that the caller may reach.

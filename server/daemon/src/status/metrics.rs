@@ -11,10 +11,11 @@ use clearway_mapping::sensor::mount::check::MountDeviation;
 use super::assess::Assessment;
 use super::health::State;
 use super::process;
-use super::reasons::{CLOSE_REASONS, OBSERVATION_REASONS, PACKET_REASONS};
+use super::reasons::{ANNOUNCEMENT_REASONS, CLOSE_REASONS, OBSERVATION_REASONS, PACKET_REASONS};
 use super::text_format::TextFormat;
 use super::transports::Transport;
 use super::vehicle::{Snapshot, VehicleStatus};
+use crate::fleet::Fleet;
 use crate::traces::StageTimes;
 
 /// Counts of a TCP listener.
@@ -26,8 +27,8 @@ pub struct ListenerCounts {
     pub closed: BTreeMap<&'static str, u64>,
 }
 
-/// The text of `/metrics`: of these vehicles, and of the TCP listeners by name.
-pub fn prometheus(vehicles: &[Arc<VehicleStatus>], listeners: &[(&str, ListenerCounts)]) -> String {
+/// The text of `/metrics`: of these vehicles, of the TCP listeners by name, and of other servers' announcements.
+pub fn prometheus(vehicles: &[Arc<VehicleStatus>], listeners: &[(&str, ListenerCounts)], fleet: &Fleet) -> String {
     let observed = |status: &Arc<VehicleStatus>| ObservedVehicle {
         status: status.clone(),
         snapshot: status.snapshot(),
@@ -41,6 +42,10 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>], listeners: &[(&str, ListenerC
     metrics.write_readers();
     metrics.write_recorder();
     metrics.write_listeners(listeners);
+    let refused = with_zeros(&ANNOUNCEMENT_REASONS, &fleet.refused());
+    let refused = refused.into_iter().map(|(reason, n)| (vec![("reason", reason.to_owned())], n));
+    let help = "Announcements of other servers that were refused, by reason.";
+    metrics.text.family("clearway_announcements_refused_total", help, refused);
     metrics.write_process(&process::read());
     metrics.text.into_text()
 }
@@ -326,7 +331,7 @@ mod tests {
     use super::*;
 
     fn text(status: VehicleStatus) -> String {
-        prometheus(&[Arc::new(status)], &[])
+        prometheus(&[Arc::new(status)], &[], &Fleet::default())
     }
 
     #[test]
@@ -384,6 +389,7 @@ mod tests {
         assert!(text.contains("# TYPE clearway_maps_total counter\n"), "{text}");
         for line in [
             "clearway_packets_refused_total{vehicle=\"car\",reason=\"length\"} 0\n",
+            "clearway_announcements_refused_total{reason=\"full\"} 0\n",
             "clearway_skipped_maps_total{vehicle=\"car\",transport=\"page\"} 0\n",
             "clearway_vehicle_state{vehicle=\"car\",state=\"error\"} 1\n",
             "clearway_map_latency_seconds_count{vehicle=\"car\",stage=\"map\"} 0\n",

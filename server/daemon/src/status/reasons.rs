@@ -64,3 +64,5 @@ pub const CLOSE_REASONS: [&str; 16] = [
     "streams",
     "unknown_vehicle",
 ];
+/// Reasons for which announcements of other servers are refused.
+pub const ANNOUNCEMENT_REASONS: [&str; 2] = ["full", "invalid"];
