@@ -37,7 +37,8 @@ struct ObservationSender {
     sent: SentObservations,
 }
 
-/// Sends the observations of a plan, those of scans and drives from `sensor`; returns when the outcome of each is known.
+/// Sends the observations of a plan, its scans and drives as readings of `sensor`; returns when the outcome of each is
+/// known.
 ///
 /// # Errors
 /// If a file cannot be read, or the server ends the stream.
