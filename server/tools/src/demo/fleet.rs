@@ -26,7 +26,7 @@ const DRIVES: Duration = Duration::from_secs(60);
 const FAILS: Duration = Duration::from_secs(20);
 
 /// The cars, and what was sent.
-pub struct Fleet<'a> {
+pub struct DemoFleet<'a> {
     running: &'a Running,
     sensors: DemoSensors,
     choice: &'a SensorChoice,
@@ -35,7 +35,7 @@ pub struct Fleet<'a> {
     sent: Sent,
 }
 
-impl<'a> Fleet<'a> {
+impl<'a> DemoFleet<'a> {
     /// Starts all cars.
     pub fn start(running: &'a Running, sensors: DemoSensors, choice: &'a SensorChoice, count: usize) -> Result<Self> {
         let mut fleet = Self { running, sensors, choice, cars: Vec::new(), sent: Sent::default() };

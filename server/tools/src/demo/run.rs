@@ -19,7 +19,7 @@ use clearway_journal::RecordedMaps;
 use clearway_journal::encode::EncodedMap;
 
 use super::car;
-use super::fleet::{Fleet, NOWHERE, name, rig};
+use super::fleet::{DemoFleet, NOWHERE, name, rig};
 use super::report::{DemoReport, DemoSummary};
 use super::rig::{self, Rig};
 use super::sensors::{self, DemoSensors, SensorChoice};
@@ -91,7 +91,7 @@ pub async fn demo(
     // The picture and the line need these layers, whether or not a reader subscribes to them.
     let _subscription = served.wires.subscriptions.subscribe(&["freespace".to_owned(), "drivability".to_owned()]);
     // The cars start after everything else, so that their first firings are now.
-    let mut fleet = Fleet::start(&running, sensors, &choice, count)?;
+    let mut fleet = DemoFleet::start(&running, sensors, &choice, count)?;
     let cpu_s = || process::read().cpu_s;
     let cpu_before_s = cpu_s();
 
@@ -100,7 +100,7 @@ pub async fn demo(
     tokio::pin!(stop, end);
     let sensors = if sensors == DemoSensors::Many { "eight sensors" } else { sensors::name(choice.model) };
     let mut last = DemoReport { validity, sensors, ..DemoReport::default() };
-    let now = |last: &DemoReport, fleet: &Fleet<'_>| {
+    let now = |last: &DemoReport, fleet: &DemoFleet<'_>| {
         let snapshot = served.status.snapshot();
         let age_ms = (snapshot.maps > 0).then(|| (now_ns() - snapshot.newest_capture_end_ns) as f64 / 1e6);
         last.next(began.elapsed(), snapshot, age_ms, fleet.skipped())
