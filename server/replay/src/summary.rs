@@ -178,6 +178,13 @@ impl ReplaySummary {
         }
     }
 
+    /// What is remarkable about the files, one remark a line, for people.
+    pub fn remarks(&self) -> Vec<String> {
+        let warning = |of: &Truncated| format!("warning: {}: {}; the rest was used", of.file.display(), of.reason);
+        let notes = self.notes.iter().map(|note| format!("note: {note}"));
+        self.truncated.iter().map(warning).chain(notes).collect()
+    }
+
     /// The summary as a few lines of text.
     pub fn to_text(&self) -> String {
         let is_several = !self.others.is_empty();

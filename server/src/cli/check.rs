@@ -3,8 +3,8 @@
 use anyhow::Result;
 use clap::Args;
 
-use crate::cli::shared::configuration::ConfigurationOptions;
-use crate::cli::shared::output::print;
+use crate::arguments::configuration::ConfigurationOptions;
+use crate::terminal::{Exit, print};
 use clearway_daemon::base::clock::now_ns;
 use clearway_daemon::config::{COMMENTED, Config};
 use clearway_daemon::publish::listen::security::Current;
@@ -38,16 +38,11 @@ pub struct CheckArguments {
 }
 
 /// Prints the configuration that the options name, as TOML.
-///
-/// # Errors
-/// [`ConfigError`](clearway_daemon::config::ConfigError), also for a calibration or a certificate that the file
-/// names; an error
-/// of certificates that do not fit or of the file of `[zenoh]`.
-pub fn run(options: &CheckArguments) -> Result<()> {
+pub fn run(options: &CheckArguments) -> Result<Exit> {
     let CheckArguments { default, configuration } = options;
     if *default {
         print(COMMENTED)?;
-        return Ok(());
+        return Ok(Exit::Good);
     }
     let config = configuration.load()?;
     config.calibrations(&configuration.config)?;
@@ -64,5 +59,5 @@ pub fn run(options: &CheckArguments) -> Result<()> {
     }
     let ConfigurationOptions { config: file, vehicles, .. } = configuration;
     print(&format!("{HEAD}{}", Config::explain(file, &configuration.overrides(), vehicles)?))?;
-    Ok(())
+    Ok(Exit::Good)
 }

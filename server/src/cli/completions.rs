@@ -4,7 +4,7 @@ use anyhow::Result;
 use clap::{Args, Command};
 use clap_complete::Shell;
 
-use crate::cli::shared::output::print;
+use crate::terminal::{Exit, print};
 
 /// Print the completion script of a shell.
 #[derive(Args)]
@@ -18,12 +18,9 @@ pub struct CompletionsArguments {
 }
 
 /// Prints the script that completes the subcommands and options of `command`.
-///
-/// # Errors
-/// As [`print()`].
-pub fn run(options: &CompletionsArguments, mut command: Command) -> Result<()> {
+pub fn run(options: &CompletionsArguments, mut command: Command) -> Result<Exit> {
     let mut script = Vec::new();
     clap_complete::generate(options.shell, &mut command, "clearway", &mut script);
     print(&String::from_utf8_lossy(&script))?;
-    Ok(())
+    Ok(Exit::Good)
 }

@@ -11,7 +11,8 @@ use clearway_tools::demo::run::{BLACK_BOX_MIB, RECORDING_MIB};
 use clearway_tools::demo::sensors::DemoSensors;
 use clearway_tools::demo::{DemoEndpoints, DemoOptions, demo};
 
-use super::shared::output::{block_on, print_line, stop_signal};
+use crate::process::stop_signal;
+use crate::terminal::{Exit, print_line};
 
 /// Drive a simulated car against a server of its own, over real UDP, and serve its maps.
 ///
@@ -51,14 +52,7 @@ fn seconds(text: &str) -> Result<Duration, String> {
 }
 
 /// Runs the demo and prints a line a second.
-///
-/// # Errors
-/// As [`demo`].
-pub fn run(arguments: DemoArguments) -> Result<()> {
-    block_on(demo_and_print(arguments))
-}
-
-async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
+pub async fn run(arguments: DemoArguments) -> Result<Exit> {
     let DemoArguments { seconds: duration, record, sensors, vehicles, any_port } = arguments;
     let pictures = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let picture = record.as_ref().map_or_else(|| pictures.join("demo.png"), |record| record.with_extension("png"));
@@ -87,7 +81,7 @@ async fn demo_and_print(arguments: DemoArguments) -> Result<()> {
     let summary = driven?;
     print_line(&left_behind(&file, &picture, began))?;
     print_line(&summary.text())?;
-    Ok(())
+    Ok(Exit::Good)
 }
 
 /// What the demo leaves on the disk.

@@ -13,9 +13,8 @@ use clearway_tools::evaluate::source::variation::Variation;
 use clearway_tools::evaluate::{EvaluateOptions, evaluate};
 use indicatif::ProgressBar;
 
-use super::shared::configuration::extrinsics;
-use super::shared::exit::Exit;
-use super::shared::output::{print, print_line, usage_error};
+use crate::arguments::values::extrinsics;
+use crate::terminal::{Exit, print, print_line, usage_error};
 
 /// Judge every map against labelled scans, simulated scenes or random worlds.
 ///
@@ -111,28 +110,13 @@ fn variations(names: &[String]) -> Result<Vec<Variation>, String> {
 }
 
 /// Judges the maps and prints the report.
-///
-/// # Errors
-/// As [`evaluate`].
 pub fn run(arguments: EvaluateArguments) -> Result<Exit> {
-    let EvaluateArguments {
-        paths,
-        labels,
-        json,
-        extrinsics,
-        model,
-        variations: names,
-        objects,
-        write_scans,
-        seeds,
-        config,
-        set,
-        fail_under,
-    } = arguments;
-    let variations = variations(&names).map_err(usage_error)?;
+    let variations = variations(&arguments.variations).map_err(usage_error)?;
+    let EvaluateArguments { paths, labels, extrinsics, model, objects, write_scans, seeds, config, set, .. } =
+        arguments;
     let options =
         EvaluateOptions { paths, labels, extrinsics, model, variations, objects, write_scans, seeds, config, set };
-    let shown = !json && std::io::stderr().is_terminal();
+    let shown = !arguments.json && std::io::stderr().is_terminal();
     let bar = if shown { ProgressBar::new(0) } else { ProgressBar::hidden() };
     let outcome = evaluate(&options, |done, total| {
         bar.set_length(total);
@@ -140,12 +124,12 @@ pub fn run(arguments: EvaluateArguments) -> Result<Exit> {
     });
     bar.finish_and_clear();
     let evaluation = outcome?;
-    if json {
+    if arguments.json {
         print_line(&format!("{:#}", evaluation.to_json()))?
     } else {
         print(&evaluation.to_text())?
     };
-    let failures = evaluation.failures(&fail_under);
+    let failures = evaluation.failures(&arguments.fail_under);
     failures.iter().for_each(|failure| eprintln!("clearway: {failure}"));
     Ok(if failures.is_empty() { Exit::Good } else { Exit::Differs })
 }

@@ -6,11 +6,9 @@ use anyhow::Result;
 use clap::Args;
 use clearway_tools::export::{ExportFormat, ExportOptions, Exported, export};
 
-use super::picture_options::PictureOptions;
-use super::shared::exit::Exit;
-use super::shared::files;
-use super::shared::output::{counted, print_line, usage_error};
-use super::shared::progress::progress_bar;
+use crate::arguments::pictures::PictureOptions;
+use crate::terminal::{Exit, counted, print_line, progress_bar, usage_error};
+use clearway_daemon::base::files;
 
 /// Export the maps of a recording: files for each map, or one MCAP file for viewers.
 ///
@@ -51,9 +49,6 @@ pub struct ExportArguments {
 }
 
 /// Exports the maps and prints their numbers.
-///
-/// # Errors
-/// If an option does not fit the format; as [`export`].
 pub fn run(arguments: ExportArguments) -> Result<Exit> {
     let ExportArguments { recording, layers, format, out, vehicle, no_points, pictures } = arguments;
     if let Some(option) = pictures.first_given().filter(|_| format != ExportFormat::Png) {

@@ -1,25 +1,18 @@
 //! `clearway get`: a server -> its newest map, printed or written to a file.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
-use anyhow::{Context, Error, Result};
+use anyhow::{Context, Result};
 use clap::Args;
-use clearway_client::{ClientError, Layer, MapView, now_ns};
+use clearway_client::{Layer, MapView, now_ns};
 use clearway_tools::export::{layer_json, npy};
 use clearway_tools::picture::{self, PictureStyle};
 use serde_json::{Value, json};
 
-use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::picture_options::PictureOptions;
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::files;
-use crate::cli::shared::output::{age_text, block_on, print_line, usage_error};
-
-/// Interval at which a server is asked again. Ours: a tenth of a second is a revolution.
-const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Longest wait: a day.
-const WAIT_MAX: Duration = Duration::from_secs(86_400);
+use crate::arguments::pictures::PictureOptions;
+use crate::connect::{ServerOptions, newest};
+use crate::terminal::{Exit, age_text, print_line, usage_error};
+use clearway_daemon::base::files;
 
 /// Get the newest map: print one layer's classes and metrics, or write the layer to a file.
 ///
@@ -56,44 +49,13 @@ pub struct GetArguments {
 }
 
 /// Gets the newest map.
-///
-/// # Errors
-/// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer; if the file cannot be
-/// written.
-pub fn run(options: &GetArguments) -> Result<Exit> {
+pub async fn run(options: &GetArguments) -> Result<Exit> {
     let format = options.out.as_deref().map(Format::from_name).transpose()?;
     if let Some(option) = options.drawing.first_given().filter(|_| format != Some(Format::Png)) {
         return Err(usage_error(format!("{option} is for pictures: it needs --out FILE.png")));
     }
-    block_on(get(options, format))
-}
-
-/// Format of the file.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Format {
-    Png,
-    Npy,
-    Json,
-}
-
-impl Format {
-    /// The format that the end of a file's name gives.
-    fn from_name(file: &Path) -> Result<Self> {
-        match file.extension().and_then(|extension| extension.to_str()).unwrap_or("") {
-            "png" => Ok(Self::Png),
-            "npy" => Ok(Self::Npy),
-            "json" => Ok(Self::Json),
-            other => Err(usage_error(format!(
-                "--out {}: the name ends in {other:?}; .png, .npy and .json are allowed",
-                file.display()
-            ))),
-        }
-    }
-}
-
-async fn get(options: &GetArguments, format: Option<Format>) -> Result<Exit> {
     let GetArguments { layer, out, json, drawing, .. } = options;
-    let map = newest(options).await?;
+    let map = newest(&options.server, &options.vehicle, layer.as_deref(), options.wait.unwrap_or_default()).await?;
     let layer = match layer {
         Some(name) => map.layer(name)?,
         None => map.layers().first().context("the map has no layer")?,
@@ -129,34 +91,26 @@ async fn get(options: &GetArguments, format: Option<Format>) -> Result<Exit> {
     Ok(Exit::from_stale(stale))
 }
 
-/// The newest map. With `--wait` it is fresh, unless none comes in that time; then the answer of the server holds.
-async fn newest(options: &GetArguments) -> Result<MapView> {
-    let limit = Duration::try_from_secs_f64(options.wait.unwrap_or_default());
-    let wait = options.wait.unwrap_or_default();
-    let limit = limit.map_err(|_| usage_error(format!("--wait={wait}: 0 or more seconds are allowed")))?;
-    let until = Instant::now() + limit.min(WAIT_MAX);
-    loop {
-        let answer = ask(options).await;
-        let is_fresh = answer.as_ref().is_ok_and(|map| !map.is_stale(now_ns()));
-        if is_fresh || Instant::now() >= until || answer.as_ref().is_err_and(|error| !is_passing(error)) {
-            return answer;
+/// Format of the file.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Format {
+    Png,
+    Npy,
+    Json,
+}
+
+impl Format {
+    /// The format that the end of a file's name gives.
+    fn from_name(file: &Path) -> Result<Self> {
+        match file.extension().and_then(|extension| extension.to_str()).unwrap_or("") {
+            "png" => Ok(Self::Png),
+            "npy" => Ok(Self::Npy),
+            "json" => Ok(Self::Json),
+            other => Err(usage_error(format!(
+                "--out {}: the name ends in {other:?}; .png, .npy and .json are allowed",
+                file.display()
+            ))),
         }
-        tokio::time::sleep(POLL_INTERVAL).await;
-    }
-}
-
-async fn ask(options: &GetArguments) -> Result<MapView> {
-    let client = options.server.connect().await?;
-    let layers: Vec<String> = options.layer.iter().cloned().collect();
-    client.newest(&options.vehicle, &layers).await.map_err(explain)
-}
-
-/// True for an error that passes by itself: no server answers yet, or it has no map yet.
-fn is_passing(error: &Error) -> bool {
-    match error.downcast_ref::<ClientError>() {
-        Some(ClientError::Unreachable { .. }) => true,
-        Some(error) => error.to_string().contains("no map"),
-        None => false,
     }
 }
 

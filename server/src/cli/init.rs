@@ -9,8 +9,8 @@ use clap::Args;
 use clearway_daemon::config::Config;
 use clearway_tools::init::{SensorSearch, find_sensors, vehicle_name};
 
-use super::shared::files;
-use super::shared::output::print_line;
+use crate::terminal::{Exit, print_line};
+use clearway_daemon::base::files;
 
 /// Find sensors by their packets, and write a first configuration.
 ///
@@ -44,10 +44,7 @@ pub struct InitArguments {
 }
 
 /// Finds the sensors and writes the configuration.
-///
-/// # Errors
-/// If the file exists, nothing can be read or listened to, or no sensor is found.
-pub fn run(arguments: InitArguments) -> Result<()> {
+pub fn run(arguments: InitArguments) -> Result<Exit> {
     let InitArguments { from, listen, seconds, vehicle, out, force } = arguments;
     let file = out.display();
     // Before the wait.
@@ -67,5 +64,5 @@ pub fn run(arguments: InitArguments) -> Result<()> {
         Ok(_) => format!("wrote {file}; next: clearway serve --config {file}"),
         Err(error) => format!("wrote {file}, which is not complete yet: {error}"),
     })?;
-    Ok(())
+    Ok(Exit::Good)
 }

@@ -1,10 +1,10 @@
 //! The command `clearway`: the list of its subcommands and the function that runs each.
 //!
-//! Each subcommand is one file with its options (as clap reads them from the command line) and its `run`.
+//! Each subcommand is one file with its options (as clap reads them from the command line) and its `run`, which returns
+//! the exit code. An error is printed with its causes; [`Exit`] says how it ends the command.
 
 mod check;
 mod completions;
-mod connection;
 mod info;
 mod ingest;
 mod recorder;
@@ -13,8 +13,6 @@ mod recordings;
 mod repair;
 mod replay;
 mod serve;
-mod service_manager;
-mod shared;
 mod status;
 mod top;
 mod transport;
@@ -25,7 +23,7 @@ mod verify;
 mod view;
 mod watch;
 
-// The subcommands of the feature `tools`, and what they share.
+// The subcommands that never run on a vehicle.
 #[cfg(feature = "tools")]
 mod demo;
 #[cfg(feature = "tools")]
@@ -37,23 +35,18 @@ mod get;
 #[cfg(feature = "tools")]
 mod init;
 #[cfg(feature = "tools")]
-mod picture_options;
-#[cfg(feature = "tools")]
 mod send;
 #[cfg(feature = "tools")]
 mod simulate;
-#[cfg(feature = "tools")]
-mod tool_commands;
 
 use std::process::ExitCode;
 
 use anyhow::Result;
-use clap::error::{ContextKind, ContextValue, ErrorKind};
-use clap::{Arg, CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
-use shared::exit::{EXIT_CODES, Exit};
-use shared::logs;
-use shared::output::{printable, with_causes};
+use crate::process::block_on;
+use crate::terminal::logs;
+use crate::terminal::{EXIT_CODES, Exit, print_error, print_usage, with_tip};
 
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]
@@ -85,8 +78,19 @@ enum ClearwayCommand {
     Recordings(recordings::RecordingsArguments),
     Ingest(ingest::IngestArguments),
     #[cfg(feature = "tools")]
-    #[command(flatten)]
-    Tool(tool_commands::ToolCommand),
+    Demo(demo::DemoArguments),
+    #[cfg(feature = "tools")]
+    Evaluate(evaluate::EvaluateArguments),
+    #[cfg(feature = "tools")]
+    Init(init::InitArguments),
+    #[cfg(feature = "tools")]
+    Get(get::GetArguments),
+    #[cfg(feature = "tools")]
+    Export(export::ExportArguments),
+    #[cfg(feature = "tools")]
+    Send(send::SendArguments),
+    #[cfg(feature = "tools")]
+    Simulate(simulate::SimulateArguments),
     Completions(completions::CompletionsArguments),
 }
 
@@ -113,85 +117,49 @@ fn after_help() -> String {
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
     let matches = command().try_get_matches();
-    let arguments = match matches.and_then(|matches| ClearwayArguments::from_arg_matches(&matches)) {
-        Ok(arguments) => arguments,
-        Err(usage) => return print_usage(&with_tip(usage, std::env::args())),
+    let exit = match matches.and_then(|matches| ClearwayArguments::from_arg_matches(&matches)) {
+        Ok(arguments) => logs::start().and_then(|()| run(arguments.command)).unwrap_or_else(print_error),
+        Err(usage) => print_usage(&with_tip(usage, &command(), std::env::args())),
     };
-    match logs::start().and_then(|()| run(arguments.command)) {
-        Ok(exit) => exit.into(),
-        Err(error) => match error.downcast::<clap::Error>() {
-            Ok(usage) => print_usage(&usage),
-            Err(error) => {
-                eprintln!("clearway: {}", printable(&with_causes(&error)));
-                Exit::Unreadable.into()
-            }
-        },
-    }
-}
-
-/// The error of an unknown word or option with a tip: of a word, the options of the subcommand that take a value; of an
-/// option that the subcommand reads as a word, this. The tip of clap would pass an unknown option on as a word.
-fn with_tip(mut usage: clap::Error, words: impl Iterator<Item = String>) -> clap::Error {
-    let Some(ContextValue::String(given)) = usage.get(ContextKind::InvalidArg) else { return usage };
-    if usage.kind() != ErrorKind::UnknownArgument {
-        return usage;
-    }
-    let command = command();
-    let called = words.skip(1).fold(&command, |called, word| called.find_subcommand(word).unwrap_or(called));
-    let value = |argument: &Arg| argument.get_value_names().unwrap_or_default().join(" ");
-    let tip = match given.strip_prefix("--") {
-        Some(name) => called
-            .get_positionals()
-            .find(|argument| value(argument).eq_ignore_ascii_case(name))
-            .map(|argument| format!("'{}' is a word without '{given}'", value(argument))),
-        None if given.starts_with('-') => None,
-        None => {
-            let options = called.get_opts().filter(|option| option.get_action().takes_values());
-            let named = options.filter_map(|option| Some(format!("--{} <{}>", option.get_long()?, value(option))));
-            Some(named.collect::<Vec<_>>().join(", "))
-                .filter(|options| !options.is_empty())
-                .map(|options| format!("a value needs its option: {options}"))
-        }
-    };
-    usage.remove(ContextKind::Suggested);
-    if let Some(tip) = tip {
-        usage.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![tip.into()]));
-    }
-    usage
-}
-
-/// Prints an error of usage, or the help that was asked for.
-fn print_usage(usage: &clap::Error) -> ExitCode {
-    // A closed stdout or stderr changes nothing.
-    let _ = usage.print();
-    if usage.use_stderr() { Exit::WrongUse.into() } else { Exit::Good.into() }
+    exit.into()
 }
 
 fn run(command: ClearwayCommand) -> Result<Exit> {
     match command {
-        ClearwayCommand::Serve(options) => serve::run(&options)?,
-        ClearwayCommand::Replay(options) => return replay::run(*options),
-        ClearwayCommand::View(options) => return view::run(options),
-        ClearwayCommand::Transport(options) => transport::run(&options)?,
-        ClearwayCommand::Verify(options) => return verify::run(&options),
-        ClearwayCommand::Check(options) => check::run(&options)?,
-        ClearwayCommand::Watch(options) => return watch::run(&options),
-        ClearwayCommand::Vehicles(options) => vehicles::run(&options)?,
-        ClearwayCommand::Status(options) => return status::run(&options),
-        ClearwayCommand::Top(options) => top::run(&options)?,
-        ClearwayCommand::Recorder(options) => return recorder::run(options),
-        ClearwayCommand::Info(options) => return info::run(&options),
-        ClearwayCommand::Repair(options) => return repair::run(&options),
+        ClearwayCommand::Serve(options) => serve::run(&options),
+        ClearwayCommand::Replay(options) => block_on(replay::run(*options)),
+        ClearwayCommand::View(options) => block_on(view::run(options)),
+        ClearwayCommand::Transport(options) => block_on(transport::run(&options)),
+        ClearwayCommand::Verify(options) => verify::run(&options),
+        ClearwayCommand::Check(options) => check::run(&options),
+        ClearwayCommand::Watch(options) => block_on(watch::run(&options)),
+        ClearwayCommand::Vehicles(options) => block_on(vehicles::run(&options)),
+        ClearwayCommand::Status(options) => block_on(status::run(&options)),
+        ClearwayCommand::Top(options) => block_on(top::run(&options)),
+        ClearwayCommand::Recorder(options) => block_on(recorder::run(options)),
+        ClearwayCommand::Info(options) => info::run(&options),
+        ClearwayCommand::Repair(options) => repair::run(&options),
         #[cfg(feature = "store")]
-        ClearwayCommand::Upload(options) => return upload::run(&options),
+        ClearwayCommand::Upload(options) => block_on(upload::run(&options)),
         #[cfg(feature = "store")]
-        ClearwayCommand::Recordings(options) => return recordings::run(&options),
-        ClearwayCommand::Ingest(options) => ingest::run(&options)?,
+        ClearwayCommand::Recordings(options) => block_on(recordings::run(&options)),
+        ClearwayCommand::Ingest(options) => block_on(ingest::run(&options)),
         #[cfg(feature = "tools")]
-        ClearwayCommand::Tool(command) => return tool_commands::run(command),
-        ClearwayCommand::Completions(options) => completions::run(&options, self::command())?,
+        ClearwayCommand::Demo(options) => block_on(demo::run(options)),
+        #[cfg(feature = "tools")]
+        ClearwayCommand::Evaluate(options) => evaluate::run(options),
+        #[cfg(feature = "tools")]
+        ClearwayCommand::Init(options) => init::run(options),
+        #[cfg(feature = "tools")]
+        ClearwayCommand::Get(options) => block_on(get::run(&options)),
+        #[cfg(feature = "tools")]
+        ClearwayCommand::Export(options) => export::run(options),
+        #[cfg(feature = "tools")]
+        ClearwayCommand::Send(options) => send::run(options),
+        #[cfg(feature = "tools")]
+        ClearwayCommand::Simulate(options) => simulate::run(&options),
+        ClearwayCommand::Completions(options) => completions::run(&options, self::command()),
     }
-    Ok(Exit::Good)
 }
 
 /// The command line as clap reads it.
@@ -205,21 +173,11 @@ fn command() -> clap::Command {
 
 #[cfg(test)]
 mod tests {
-    use anyhow::Error;
-
     use super::*;
 
     #[test]
     fn the_command_line_is_sound() {
         command().debug_assert();
-    }
-
-    #[test]
-    fn an_error_names_each_cause_once() {
-        let cause = std::io::Error::other("the disk is full");
-        assert_eq!(with_causes(&Error::new(cause).context("write a.png")), "write a.png: the disk is full");
-        let cause = std::io::Error::other("the disk is full");
-        assert_eq!(with_causes(&Error::new(cause).context("a.png: the disk is full")), "a.png: the disk is full");
     }
 
     #[test]

@@ -7,9 +7,8 @@ use clearway_proto::v1;
 use serde_json::json;
 use tonic::Code;
 
-use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
+use crate::connect::{ServerOptions, explain};
+use crate::terminal::{Exit, counted, print_line, usage_error};
 use clearway_daemon::status::recorder_json;
 use clearway_journal::damage::utc;
 
@@ -57,14 +56,7 @@ enum RecorderSubcommand {
 }
 
 /// Sends the request and prints the answer.
-///
-/// # Errors
-/// If the server cannot be reached or refuses the request.
-pub fn run(options: RecorderArguments) -> Result<Exit> {
-    block_on(send(options))
-}
-
-async fn send(RecorderArguments { server, json, request }: RecorderArguments) -> Result<Exit> {
+pub async fn run(RecorderArguments { server, json, request }: RecorderArguments) -> Result<Exit> {
     let mut recorder = server.connect().await?.recorder().await?;
     let refused = |status: tonic::Status| match std::error::Error::source(&status) {
         // No answer of the server, but of the connection to it.

@@ -9,8 +9,7 @@ use clap::Args;
 use serde_json::json;
 use tempfile::NamedTempFile;
 
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print_line};
+use crate::terminal::{Exit, counted, print_line};
 use clearway_daemon::store::fetch::copy;
 use clearway_daemon::store::index::{Entry, Found, Search, search};
 use clearway_daemon::store::location;
@@ -55,10 +54,7 @@ pub struct RecordingsArguments {
 }
 
 /// Searches, fetches if wanted, and prints what is found.
-///
-/// # Errors
-/// If the store's URL is wrong or it does not answer, or a file exists or cannot be written.
-pub fn run(options: &RecordingsArguments) -> Result<Exit> {
+pub async fn run(options: &RecordingsArguments) -> Result<Exit> {
     let wanted = Search {
         vehicle: options.vehicle.clone(),
         from_ns: options.from,
@@ -68,8 +64,7 @@ pub fn run(options: &RecordingsArguments) -> Result<Exit> {
     };
     let store = location::open_existing(&options.store)?;
     let of_store = |error| Error::msg(format!("store {}: {}", options.store, reason(&error)));
-    let Found { entries, without_place, unreadable } =
-        block_on(async { search(&*store, &wanted).await.map_err(of_store) })?;
+    let Found { entries, without_place, unreadable } = search(&*store, &wanted).await.map_err(of_store)?;
     if let Some(folder) = &options.out {
         std::fs::create_dir_all(folder).with_context(|| format!("create the folder {}", folder.display()))?;
         // A part has an entry for each vehicle.
@@ -77,7 +72,8 @@ pub fn run(options: &RecordingsArguments) -> Result<Exit> {
         for part in parts {
             let file = folder.join(part.rsplit('/').next().unwrap_or(part));
             let mut unfinished = NamedTempFile::new_in(folder)?;
-            block_on(async { copy(&*store, &part.into(), &mut unfinished).await })
+            copy(&*store, &part.into(), &mut unfinished)
+                .await
                 .with_context(|| format!("fetch {part} to {}", file.display()))?;
             unfinished.persist_noclobber(&file).with_context(|| format!("write {}", file.display()))?;
         }

@@ -5,8 +5,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{counted, print_line};
+use crate::terminal::{Exit, counted, print_line};
 use clearway_journal::repair::repair;
 
 /// Write all that can be read of a damaged MCAP file to a new one, and report what is lost.
@@ -32,11 +31,6 @@ pub struct RepairArguments {
 }
 
 /// Repairs the file and prints what is lost.
-///
-/// # Errors
-/// [`RepairError`](clearway_journal::repair::RepairError) if the file cannot be read, has no message that can be
-/// read, or
-/// the new file cannot be written.
 pub fn run(options: &RepairArguments) -> Result<Exit> {
     let report = repair(&options.input, &options.output)?;
     if options.json {

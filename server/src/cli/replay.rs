@@ -1,8 +1,6 @@
 //! `clearway replay`: recorded drives -> maps, a recording, readers.
 
-use std::future::pending;
 use std::io::IsTerminal;
-use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -12,15 +10,13 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 use clearway_replay::player::faults::Fault;
 use clearway_replay::summary::why_no_map;
-use clearway_replay::{ReplayOptions, ReplayRun, ReplaySpeed, ReplaySummary, ServedReplay, describe};
-use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use tokio::io::AsyncReadExt;
-use tokio::net::unix::pipe;
+use clearway_replay::{ReplayOptions, ReplayRun, ReplaySpeed, ServedReplay, describe};
 
-use crate::cli::shared::configuration::extrinsics;
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::model::ModelParser;
-use crate::cli::shared::output::{block_on, draw_progress, print, print_line, stop_signal, usage_error};
+use crate::arguments::model::ModelParser;
+use crate::arguments::values::{extrinsics, offset, seconds};
+use crate::process::stdin;
+use crate::process::stop_signal;
+use crate::terminal::{Exit, draw_progress, print, print_line, usage_error};
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI, nuScenes and PCD files or folders.
 ///
@@ -131,29 +127,9 @@ impl From<ServedArguments> for ServedReplay {
     }
 }
 
-/// Greatest number of seconds, about 30 years. Ours.
-const SECONDS_MAX: f64 = 1e9;
-
-/// Reads a number of seconds after the first event.
-///
-/// # Errors
-/// If it is not a number from 0 to 1000000000.
-pub fn offset(text: &str) -> Result<f64, String> {
-    let found = text.parse().ok().filter(|seconds| (0.0..=SECONDS_MAX).contains(seconds));
-    found.ok_or_else(|| "0 to 1000000000 seconds are allowed".into())
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    let found = offset(text).ok().filter(|seconds| *seconds > 0.0);
-    found.ok_or_else(|| "a number of seconds above 0, up to 1000000000, is allowed".into())
-}
-
 /// Replays the files and prints the summary. A file that is not whole, or a signal before the end, is
 /// [`Exit::Unreadable`].
-///
-/// # Errors
-/// [`ReplayError`](clearway_replay::ReplayError).
-pub fn run(arguments: ReplayArguments) -> Result<Exit> {
+pub async fn run(arguments: ReplayArguments) -> Result<Exit> {
     let ReplayArguments { files, record, json, speed, from: from_s, to: to_s, vehicle, extrinsics, .. } = arguments;
     if let (Some(from), Some(to)) = (from_s, to_s)
         && from >= to
@@ -163,7 +139,7 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
     let ReplayArguments { model, topics, config, set, faults, serve, served, .. } = arguments;
     let served: Option<ServedReplay> = serve.then(|| served.into());
     // Under cron stdin is a pipe that was closed from the start.
-    let is_of_program = served.as_ref().is_some_and(|served| served.ready_file.is_some()) && !is_stdin_closed();
+    let is_of_program = served.as_ref().is_some_and(|served| served.ready_file.is_some()) && !stdin::is_closed();
     let has_bar = !json && !serve && std::io::stderr().is_terminal();
     let options = ReplayOptions {
         files,
@@ -180,25 +156,23 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
         faults,
         served,
     };
-    let summary = block_on(async {
-        let signal = stop_signal()?;
-        let closed = tokio::spawn(stdin_closed(is_of_program));
-        let stop = async {
-            tokio::select! {
-                () = signal => {}
-                _ = closed => {}
-            }
-        };
-        let replay = ReplayRun::start(options).await?;
-        if let Some(description) = describe(replay.mount()) {
-            eprintln!("extrinsics {description}");
+    let signal = stop_signal()?;
+    let closed = tokio::spawn(stdin::closed(is_of_program));
+    let stop = async {
+        tokio::select! {
+            () = signal => {}
+            _ = closed => {}
         }
-        let bar = has_bar.then(|| draw_progress(replay.progress.bytes, replay.progress.bytes_read.clone()));
-        let summary = replay.play(stop).await;
-        drop(bar);
-        Ok(summary?)
-    })?;
-    let is_whole = print_remarks(&summary);
+    };
+    let replay = ReplayRun::start(options).await?;
+    if let Some(description) = describe(replay.mount()) {
+        eprintln!("extrinsics {description}");
+    }
+    let bar = has_bar.then(|| draw_progress(replay.progress.bytes, replay.progress.bytes_read.clone()));
+    let summary = replay.play(stop).await;
+    drop(bar);
+    let summary = summary?;
+    summary.remarks().iter().for_each(|remark| eprintln!("{remark}"));
     if json {
         print_line(&format!("{:#}", summary.to_json()))?
     } else {
@@ -209,30 +183,5 @@ pub fn run(arguments: ReplayArguments) -> Result<Exit> {
         let which = if summary.maps() == 0 { "no map" } else { "no map that shows anything" };
         eprintln!("clearway: the {} made {which}: {}", summary.what, why_no_map(&summary.mount, &summary.snapshot));
     }
-    Ok(Exit::from_incomplete(!is_whole || !summary.reached_end || has_no_map))
-}
-
-/// True if stdin is a pipe that no process writes to.
-fn is_stdin_closed() -> bool {
-    let stdin = std::io::stdin();
-    let mut asked = [PollFd::new(stdin.as_fd(), PollFlags::empty())];
-    let is_answered = poll(&mut asked, PollTimeout::ZERO).is_ok();
-    is_answered && asked[0].revents().is_some_and(|events| events.contains(PollFlags::POLLHUP))
-}
-
-/// Returns when the pipe that is stdin is closed, if that `ends` the command; never if stdin is no pipe.
-async fn stdin_closed(ends: bool) {
-    let stdin = pipe::OpenOptions::new().open_receiver("/dev/stdin").ok().filter(|_| ends);
-    let Some(mut stdin) = stdin else { return pending().await };
-    let mut ignored = [0; 64];
-    while matches!(stdin.read(&mut ignored).await, Ok(1..)) {}
-}
-
-/// Prints what is remarkable about the files on stderr; false if one of them is not whole.
-pub fn print_remarks(summary: &ReplaySummary) -> bool {
-    for truncated in &summary.truncated {
-        eprintln!("warning: {}: {}; the rest was used", truncated.file.display(), truncated.reason);
-    }
-    summary.notes.iter().for_each(|note| eprintln!("note: {note}"));
-    summary.truncated.is_empty()
+    Ok(Exit::from_incomplete(!summary.truncated.is_empty() || !summary.reached_end || has_no_map))
 }

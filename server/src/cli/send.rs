@@ -1,21 +1,17 @@
 //! `clearway send`: a capture -> its datagrams, sent again over UDP at the recorded pace.
 
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use clap::Args;
 use clearway_tools::network::{self, Faults};
-use clearway_tools::send::{Pace, SendOptions, SendSummary, send};
+use clearway_tools::send::{Pace, SendOptions, SendSummary, send, target};
 use serde_json::json;
-use tokio::runtime::Builder;
 
-use super::shared::exit::Exit;
-use super::shared::files;
-use super::shared::output::{counted, print_line, stop_signal};
-use super::shared::progress::progress_bar;
+use crate::process::stop_flag;
+use crate::terminal::{Exit, counted, print_line, progress_bar};
+use clearway_daemon::base::files;
 
 /// Send the datagrams of a capture over UDP, at the recorded pace.
 ///
@@ -71,20 +67,7 @@ fn own_address(text: &str) -> Result<SocketAddr, String> {
         .map_err(|_| "an address such as 127.0.0.2 or 127.0.0.2:2368 is allowed".into())
 }
 
-/// Finds the address of a target such as `udp://127.0.0.1:2368`.
-///
-/// # Errors
-/// If the text is not `udp://HOST:PORT` or the host has no address.
-pub fn target(text: &str) -> Result<SocketAddr> {
-    let allowed = || format!("{text:?}: udp://HOST:PORT is allowed");
-    let mut found = text.strip_prefix("udp://").with_context(allowed)?.to_socket_addrs().with_context(allowed)?;
-    found.next().with_context(|| format!("{text:?}: the host has no address"))
-}
-
 /// Sends the datagrams of the capture.
-///
-/// # Errors
-/// As [`send`].
 pub fn run(arguments: SendArguments) -> Result<Exit> {
     let SendArguments { file, to, telemetry_to, bind, speed: pace, repeats, network: faults, json } = arguments;
     let to = target(&to)?;
@@ -120,23 +103,4 @@ fn text(summary: &SendSummary, options: &SendOptions) -> String {
     lines.extend(notes.iter().cloned());
     lines.extend(cut.as_ref().map(|cut| format!("the capture is not whole: {cut}")));
     lines.join("\n")
-}
-
-/// A flag that is set at the signals of [`stop_signal`], for work that blocks.
-///
-/// # Errors
-/// As [`stop_signal`].
-pub(super) fn stop_flag() -> Result<Arc<AtomicBool>> {
-    let flag = Arc::new(AtomicBool::new(false));
-    let runtime = Builder::new_current_thread().enable_all().build()?;
-    let stopped = {
-        let _entered = runtime.enter();
-        stop_signal()?
-    };
-    let of_thread = Arc::clone(&flag);
-    std::thread::spawn(move || {
-        runtime.block_on(stopped);
-        of_thread.store(true, Ordering::Relaxed);
-    });
-    Ok(flag)
 }

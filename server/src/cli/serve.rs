@@ -4,9 +4,10 @@ use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::cli::service_manager;
-use crate::cli::shared::configuration::ConfigurationOptions;
-use crate::cli::shared::output::{block_on, stop_signal, with_causes};
+use crate::arguments::configuration::ConfigurationOptions;
+use crate::process::service_manager;
+use crate::process::{block_on, stop_signal};
+use crate::terminal::{Exit, with_causes};
 use clearway_daemon::base::held_sockets::HeldSockets;
 use clearway_daemon::config::Config;
 use clearway_daemon::run::{Running, Server, Setup, ShutdownError};
@@ -26,16 +27,12 @@ pub struct ServeArguments {
 }
 
 /// Runs the server that the configuration describes, until SIGINT or SIGTERM.
-///
-/// # Errors
-/// [`ConfigError`](clearway_daemon::config::ConfigError), [`StartError`](clearway_daemon::run::StartError), and
-/// [`ShutdownError`](clearway_daemon::run::ShutdownError) at the end.
-pub fn run(options: &ServeArguments) -> Result<()> {
+pub fn run(options: &ServeArguments) -> Result<Exit> {
     let held = HeldSockets::from_environment().context("LISTEN_FDS: a socket of the service manager")?;
     block_on(serve(&options.configuration, held))
 }
 
-async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) -> Result<()> {
+async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) -> Result<Exit> {
     let file = &configuration.config;
     let config = configuration.load()?;
     let calibrations = config.calibrations(file)?;
@@ -72,7 +69,8 @@ async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) 
         tracing::error!(%error, "ending without it");
         std::process::exit(1);
     }
-    Ok(ended?)
+    ended?;
+    Ok(Exit::Good)
 }
 
 /// Reads the configuration again and applies what can be changed without a restart; names the tables that cannot.

@@ -8,13 +8,12 @@ use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use clearway_lidar::model::Model;
 use clearway_tools::scenes::{self, SCENES};
+use clearway_tools::send::target;
 use clearway_tools::simulate::SimulatedDrive;
 
-use super::send::stop_flag;
-use super::send::target;
-use super::shared::model::ModelParser;
-use super::shared::output::{counted, print_line};
-use super::shared::progress::progress_bar;
+use crate::arguments::model::ModelParser;
+use crate::process::stop_flag;
+use crate::terminal::{Exit, counted, print_line, progress_bar};
 
 /// The names of the scenes as the command line accepts them.
 fn names() -> PossibleValuesParser {
@@ -63,10 +62,7 @@ fn seconds(text: &str) -> Result<Duration, String> {
 }
 
 /// Simulates the drive.
-///
-/// # Errors
-/// If the file exists or cannot be written, or the datagrams cannot be sent.
-pub fn run(arguments: &SimulateArguments) -> Result<()> {
+pub fn run(arguments: &SimulateArguments) -> Result<Exit> {
     let SimulateArguments { scene, sensor, seconds, endless, seed, out, to, telemetry_to } = arguments;
     let named = scenes::find(scene).expect("clap accepts only names of scenes");
     let drive = SimulatedDrive { scene: (named.make)(), model: *sensor, duration: *seconds, seed: *seed };
@@ -87,5 +83,5 @@ pub fn run(arguments: &SimulateArguments) -> Result<()> {
     let (packets, telemetry) = (counted(sent.packets, "data packet"), counted(sent.telemetry, "telemetry datagram"));
     let (seconds, sensor) = (sent.device_time.as_secs_f64(), sensor.as_str());
     print_line(&format!("{seconds:.1} s of {scene} with the sensor {sensor}: {packets} and {telemetry} {place}"))?;
-    Ok(())
+    Ok(Exit::Good)
 }

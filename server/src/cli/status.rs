@@ -4,9 +4,8 @@ use anyhow::{Result, bail};
 use clap::Args;
 use clearway_client::v1;
 
-use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{age_text, block_on, print_line};
+use crate::connect::{ServerOptions, explain};
+use crate::terminal::{Exit, age_text, print_line};
 use clearway_daemon::status::{State, vehicle_json};
 
 /// Print the state of each vehicle: ok, or what is wrong with it.
@@ -30,14 +29,7 @@ pub struct StatusArguments {
 }
 
 /// Prints the states.
-///
-/// # Errors
-/// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer; if a vehicle is unknown.
-pub fn run(options: &StatusArguments) -> Result<Exit> {
-    block_on(status(options))
-}
-
-async fn status(options: &StatusArguments) -> Result<Exit> {
+pub async fn run(options: &StatusArguments) -> Result<Exit> {
     let all = options.server.connect().await?.vehicles().await.map_err(explain)?;
     if let Some(unknown) = options.vehicles.iter().find(|name| !all.iter().any(|vehicle| vehicle.name == **name)) {
         let known = all.iter().map(|vehicle| vehicle.name.as_str()).collect::<Vec<_>>().join(", ");

@@ -6,9 +6,9 @@ use clearway_client::ClientError;
 use clearway_client::v1::{ReplayControl, ReplayPhase, ReplayState};
 use serde_json::json;
 
-use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::replay::offset;
-use crate::cli::shared::output::{block_on, print_line, usage_error};
+use crate::arguments::values::offset;
+use crate::connect::{ServerOptions, explain};
+use crate::terminal::{Exit, print_line, usage_error};
 use clearway_daemon::replay_control::STEP_MAX;
 use clearway_replay::ReplaySpeed;
 
@@ -93,19 +93,12 @@ fn on_or_off(text: &str) -> Result<bool, String> {
 }
 
 /// Changes how the replay goes on, and prints its state after the change.
-///
-/// # Errors
-/// If the server does not answer, serves no replay, or refuses the change.
-pub fn run(options: &TransportArguments) -> Result<()> {
+pub async fn run(options: &TransportArguments) -> Result<Exit> {
     if let Some(TransportRequest::Range { from: Some(from), to: Some(to), .. }) = options.request
         && from >= to
     {
         return Err(usage_error(format!("range {from} {to}: the range must end after it begins")));
     }
-    block_on(control(options))
-}
-
-async fn control(options: &TransportArguments) -> Result<()> {
     let client = options.server.connect().await?;
     let replay = match client.replay_control(ReplayControl::default()).await {
         Err(ClientError::Refused { address, code, .. }) if code == "Unimplemented" => {
@@ -118,7 +111,7 @@ async fn control(options: &TransportArguments) -> Result<()> {
         Some(request) => client.replay_control(request.to_control(&replay)).await.map_err(explain)?,
     };
     print_line(&if options.json { document(&replay) } else { line(&replay) })?;
-    Ok(())
+    Ok(Exit::Good)
 }
 
 impl TransportRequest {

@@ -1,13 +1,11 @@
 //! `clearway upload`: a folder of finished recordings -> a store, confirmed part by part.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
-use object_store::ObjectStore;
 
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print_line};
+use crate::terminal::{Exit, counted, print_line};
 use clearway_daemon::base::file_advice::advised;
 use clearway_daemon::store::location;
 use clearway_daemon::store::upload::{self, UploadError};
@@ -33,32 +31,16 @@ pub struct UploadArguments {
     delete: bool,
 }
 
-/// Sends the parts.
-///
-/// # Errors
-/// If the folder cannot be read or the store's URL is wrong. A part that is not confirmed is no error; the output and
-/// the exit code say so.
-pub fn run(options: &UploadArguments) -> Result<Exit> {
-    block_on(send(options))
-}
-
-async fn send(options: &UploadArguments) -> Result<Exit> {
+/// Sends every finished part. A part that is not confirmed is [`Exit::Unreadable`].
+pub async fn run(options: &UploadArguments) -> Result<Exit> {
+    let folder = &options.folder;
     // A folder that is not there is an error before the store's is made.
-    parts(&options.folder)?;
+    let parts =
+        upload::unconfirmed(folder).map_err(|error| anyhow!("{}: {}", folder.display(), advised(folder, error)))?;
     let store = location::open(&options.store)?;
-    let unconfirmed = send_all(options, &*store).await?;
-    Ok(Exit::from_incomplete(unconfirmed > 0))
-}
-
-fn parts(folder: &Path) -> Result<Vec<PathBuf>> {
-    upload::unconfirmed(folder).map_err(|error| anyhow!("{}: {}", folder.display(), advised(folder, error)))
-}
-
-/// Sends every finished part; returns the number of parts that are not confirmed.
-async fn send_all(options: &UploadArguments, store: &dyn ObjectStore) -> Result<u64> {
-    let mut failed = 0;
-    for part in parts(&options.folder)? {
-        match upload::upload(store, &part, None).await {
+    let mut is_incomplete = false;
+    for part in parts {
+        match upload::upload(&*store, &part, None).await {
             Ok(confirmation) => {
                 let bytes = counted(confirmation.bytes, "byte");
                 print_line(&format!("{} is confirmed: {bytes}, {}", part.display(), confirmation.part))?;
@@ -68,10 +50,10 @@ async fn send_all(options: &UploadArguments, store: &dyn ObjectStore) -> Result<
             }
             Err(error @ UploadError::Nothing { .. }) => eprintln!("clearway: not sent, and kept: {error}"),
             Err(error) => {
-                failed += 1;
+                is_incomplete = true;
                 eprintln!("clearway: not confirmed, and kept: {error}");
             }
         }
     }
-    Ok(failed)
+    Ok(Exit::from_incomplete(is_incomplete))
 }

@@ -1,15 +1,14 @@
 //! `clearway vehicles`: a server -> the state of its vehicles.
 
-use std::collections::BTreeSet;
-
 use anyhow::Result;
 use clap::Args;
 use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
-use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::shared::output::{age_text, block_on, counted, print_line};
-use clearway_daemon::status::{run_text, vehicle_json};
+use crate::connect::{ServerOptions, explain};
+use crate::terminal::{Exit, age_text, counted, print_line};
+use crate::vehicles::servers::{is_of_several_servers, server_text};
+use clearway_daemon::status::vehicle_json;
 
 /// List the vehicles of a server and of those it knows: maps, sensors, losses, readers, recording.
 #[derive(Args)]
@@ -25,20 +24,13 @@ pub struct VehiclesArguments {
 }
 
 /// Prints the state of every vehicle.
-///
-/// # Errors
-/// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer.
-pub fn run(options: &VehiclesArguments) -> Result<()> {
-    block_on(list(options))
-}
-
-async fn list(options: &VehiclesArguments) -> Result<()> {
+pub async fn run(options: &VehiclesArguments) -> Result<Exit> {
     let vehicles = options.server.connect().await?.vehicles().await.map_err(explain)?;
     let now = now_ns();
     if options.json {
         let documents: Vec<_> = vehicles.iter().map(|vehicle| document(vehicle, now)).collect();
         print_line(&serde_json::to_string_pretty(&documents)?)?;
-        return Ok(());
+        return Ok(Exit::Good);
     }
     let is_fleet = is_of_several_servers(&vehicles);
     for line in vehicles.iter().flat_map(|vehicle| lines(vehicle, is_fleet, now)) {
@@ -47,22 +39,7 @@ async fn list(options: &VehiclesArguments) -> Result<()> {
     if vehicles.is_empty() {
         print_line("the server has no vehicles")?;
     }
-    Ok(())
-}
-
-/// True if the vehicles belong to several runs of servers.
-pub fn is_of_several_servers(vehicles: &[v1::Vehicle]) -> bool {
-    vehicles.iter().map(|vehicle| vehicle.boot_id).collect::<BTreeSet<_>>().len() > 1
-}
-
-/// The server of a vehicle: its host, and its address or, if it announces none, its run. Two servers on one host have
-/// different texts.
-pub fn server_text(vehicle: &v1::Vehicle) -> String {
-    let host = if vehicle.server.is_empty() { "unknown host" } else { &vehicle.server };
-    match vehicle.grpc.is_empty() {
-        true => format!("{host} ({})", run_text(vehicle.boot_id)),
-        false => format!("{host} ({})", vehicle.grpc),
-    }
+    Ok(Exit::Good)
 }
 
 fn age_ms(vehicle: &v1::Vehicle, now: i64) -> Option<f64> {

@@ -8,9 +8,9 @@ use clap::Args;
 use clearway_proto::v1::ReplayControl;
 use clearway_replay::{ReplayOptions, ReplayRun, ServedReplay, describe};
 
-use crate::cli::replay::{offset, print_remarks};
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, print_line, stop_signal};
+use crate::arguments::values::offset;
+use crate::process::stop_signal;
+use crate::terminal::{Exit, print_line};
 
 /// Look at recorded drives on the page: paused at the first map, with a time bar, a step and all layers.
 ///
@@ -33,34 +33,30 @@ pub struct ViewArguments {
 }
 
 /// Serves the page until a signal.
-///
-/// # Errors
-/// [`ReplayError`](clearway_replay::ReplayError).
-pub fn run(arguments: ViewArguments) -> Result<Exit> {
+pub async fn run(arguments: ViewArguments) -> Result<Exit> {
     let ViewArguments { files, from: seek_s, open } = arguments;
     let served = ServedReplay { seek_s, any_port: true, paused: true, ..ServedReplay::default() };
     let options = ReplayOptions { files, served: Some(served), ..ReplayOptions::default() };
-    let summary = block_on(async {
-        let stop = stop_signal()?;
-        let replay = ReplayRun::start(options).await?;
-        if let Some(description) = describe(replay.mount()) {
-            eprintln!("extrinsics {description}");
+    let stop = stop_signal()?;
+    let replay = ReplayRun::start(options).await?;
+    if let Some(description) = describe(replay.mount()) {
+        eprintln!("extrinsics {description}");
+    }
+    if let Some(page) = replay.running.page.map(|at| format!("http://{at}/")) {
+        print_line(&page)?;
+        if open && let Err(error) = Command::new("xdg-open").arg(&page).spawn() {
+            tracing::warn!(%error, "xdg-open");
         }
-        if let Some(page) = replay.running.page.map(|at| format!("http://{at}/")) {
-            print_line(&page)?;
-            if open && let Err(error) = Command::new("xdg-open").arg(&page).spawn() {
-                tracing::warn!(%error, "xdg-open");
-            }
+    }
+    let handle = replay.handle();
+    let first_maps = async {
+        if seek_s.is_none() {
+            let step = u32::try_from(handle.state().borrow().vehicles.len()).ok();
+            // Fails if the replay ends before.
+            let _ = handle.control(ReplayControl { step, ..ReplayControl::default() }).await;
         }
-        let handle = replay.handle();
-        let first_maps = async {
-            if seek_s.is_none() {
-                let step = u32::try_from(handle.state().borrow().vehicles.len()).ok();
-                // Fails if the replay ends before.
-                let _ = handle.control(ReplayControl { step, ..ReplayControl::default() }).await;
-            }
-        };
-        Ok(tokio::join!(replay.play(stop), first_maps).0?)
-    })?;
-    Ok(Exit::from_incomplete(!print_remarks(&summary)))
+    };
+    let summary = tokio::join!(replay.play(stop), first_maps).0?;
+    summary.remarks().iter().for_each(|remark| eprintln!("{remark}"));
+    Ok(Exit::from_incomplete(!summary.truncated.is_empty()))
 }

@@ -1,25 +1,18 @@
 //! `clearway watch`: a server -> one line for each map, and a line when the maps stop.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::{Result, bail};
+use anyhow::Result;
 use clap::Args;
 use clap::builder::RangedI64ValueParser;
-use clearway_client::{ClientError, MapStream, Staleness, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{ClientError, MapStream, Staleness, StreamEvent, Update, now_ns};
 use serde_json::json;
 
-use crate::cli::connection::{ServerOptions, explain};
-use crate::cli::shared::exit::Exit;
-#[cfg(feature = "zenoh")]
-use crate::cli::shared::files;
-use crate::cli::shared::output::{block_on, counted, print_line, with_causes};
+use crate::connect::{MapOptions, explain};
+use crate::terminal::{Exit, counted, print_line};
 
 /// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
 const STALE_PERIOD: Duration = Duration::from_secs(1);
-/// The layer that is read over zenoh if none is named.
-#[cfg(feature = "zenoh")]
-const DEFAULT_LAYER: &str = "freespace";
 /// Interval at which the age of the last map is read after the stream has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
@@ -37,23 +30,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
   clearway watch --until-stale || echo \"the maps are stale\"")]
 pub struct WatchArguments {
     #[command(flatten)]
-    server: ServerOptions,
-    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447; or, with
-    /// certificates, tls/HOST:7447.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
-    zenoh: Option<String>,
-    /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
-    #[arg(long, value_name = "FILE.pub", requires = "zenoh")]
-    signed_by: Option<PathBuf>,
-    /// The vehicle, if the server has several.
-    #[arg(long, value_name = "NAME")]
-    vehicle: Option<String>,
-    /// Layers, separated by commas; all if absent. Over zenoh one layer; freespace if absent.
-    #[arg(long, alias = "layer", value_name = "LAYER", value_delimiter = ',')]
-    layers: Vec<String>,
-    /// Greatest number of maps a second; every map if absent.
-    #[arg(long, value_name = "HZ", conflicts_with = "zenoh")]
-    max_rate_hz: Option<f64>,
+    maps: MapOptions,
     /// Print each line as a JSON object.
     #[arg(long)]
     json: bool,
@@ -67,15 +44,10 @@ pub struct WatchArguments {
 
 /// Prints lines until the stream or a replay ends, the count is reached, the map is stale with `--until-stale`,
 /// or the reader of stdout has closed it.
-///
-/// # Errors
-/// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
-pub fn run(options: &WatchArguments) -> Result<Exit> {
-    block_on(watch(options))
-}
-
-async fn watch(options: &WatchArguments) -> Result<Exit> {
-    let mut maps = subscribe_when_there(options).await?;
+pub async fn run(options: &WatchArguments) -> Result<Exit> {
+    // Nothing but a person or the server ends an endless command.
+    let is_endless = options.count.is_none() && !options.until_stale;
+    let mut maps = options.maps.subscribe(is_endless).await?;
     let mut newest: Option<Update> = None;
     let (mut printed, mut is_stale) = (0, false);
     while options.count.is_none_or(|count| printed < count) && !(is_stale && options.until_stale) {
@@ -132,49 +104,6 @@ async fn wait_until_stale(last: &Update) {
     }
 }
 
-impl WatchArguments {
-    /// True if nothing but a person or the server ends the command.
-    fn is_endless(&self) -> bool {
-        self.count.is_none() && !self.until_stale
-    }
-}
-
-/// Subscribes; an endless command waits until a server answers.
-async fn subscribe_when_there(options: &WatchArguments) -> Result<MapStream> {
-    let mut said = String::new();
-    loop {
-        let error = match subscribe(options).await {
-            Ok(maps) => return Ok(maps),
-            Err(error) => error,
-        };
-        let is_away = matches!(error.downcast_ref(), Some(ClientError::Unreachable { .. }));
-        if !is_away || !options.is_endless() {
-            return Err(error);
-        }
-        let text = with_causes(&error);
-        if text != said {
-            eprintln!("clearway: {text}; waiting for it");
-            said = text;
-        }
-        tokio::time::sleep(STALE_PERIOD).await;
-    }
-}
-
-async fn subscribe(options: &WatchArguments) -> Result<MapStream> {
-    let WatchArguments { zenoh, vehicle, layers, max_rate_hz, .. } = options;
-    if let Some(endpoint) = zenoh {
-        return subscribe_over_zenoh(endpoint, options).await;
-    }
-    let subscription = Subscription {
-        vehicle: vehicle.clone().unwrap_or_default(),
-        layers: layers.clone(),
-        max_rate_hz: *max_rate_hz,
-        reconnects: options.is_endless(),
-        ..Subscription::default()
-    };
-    options.server.connect().await?.subscribe(subscription).await.map_err(explain)
-}
-
 /// The line for a new map.
 fn line(update: &Update, maps: &MapStream, as_json: bool) -> String {
     let (map, skipped, now, hostile) = (&update.map, update.skipped, now_ns(), maps.passed_over().hostile());
@@ -218,7 +147,7 @@ fn stale_line(newest: Option<&Update>, maps: &MapStream, options: &WatchArgument
             format!("{vehicle} #{sequence:06}  age {age_ms:7.1} ms  STALE: {why}; waiting")
         }
         None if options.json => {
-            let vehicle = &options.vehicle;
+            let vehicle = &options.maps.vehicle;
             json!({"vehicle": vehicle, "sequence": null, "age_ms": null, "stale": true, "reasons": reasons}).to_string()
         }
         None if reasons.is_empty() => {
@@ -226,42 +155,4 @@ fn stale_line(newest: Option<&Update>, maps: &MapStream, options: &WatchArgument
         }
         None => format!("STALE: waiting for the first map: {}", reasons.join("; ")),
     }
-}
-
-#[cfg(feature = "zenoh")]
-async fn subscribe_over_zenoh(endpoint: &str, options: &WatchArguments) -> Result<MapStream> {
-    let layer = match &options.layers[..] {
-        [] => DEFAULT_LAYER,
-        [layer] => layer,
-        several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
-    };
-    let mut connecting = std::pin::pin!(options.server.connect_over_zenoh(endpoint));
-    let mut client = match tokio::time::timeout(STALE_PERIOD, &mut connecting).await {
-        Ok(connected) => connected?,
-        Err(_) => {
-            eprintln!("clearway: {endpoint} does not answer yet");
-            connecting.await?
-        }
-    };
-    if let Some(file) = &options.signed_by {
-        client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
-    }
-    let vehicle = match (&options.vehicle, &client.vehicles().await?[..]) {
-        (Some(name), present) => {
-            if !present.contains(name) {
-                let others = if present.is_empty() { "none" } else { &present.join(", ") };
-                eprintln!("clearway: --vehicle {name}: no server at {endpoint} publishes it now (others: {others})");
-            }
-            name.clone()
-        }
-        (None, []) => bail!("no server at {endpoint} publishes a vehicle"),
-        (None, [only]) => only.clone(),
-        (None, several) => bail!("{endpoint} has {}: name one with --vehicle", several.join(", ")),
-    };
-    Ok(client.subscribe(&vehicle, layer).await?)
-}
-
-#[cfg(not(feature = "zenoh"))]
-async fn subscribe_over_zenoh(endpoint: &str, _: &WatchArguments) -> Result<MapStream> {
-    bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
 }

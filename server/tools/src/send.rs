@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;
 use std::io::BufReader;
-use std::net::SocketAddr;
+use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
@@ -47,6 +47,16 @@ pub struct SendOptions {
     pub repeats: bool,
     /// Faults of the network; `None`: a good one.
     pub faults: Option<Faults>,
+}
+
+/// Finds the address of a target such as `udp://127.0.0.1:2368`.
+///
+/// # Errors
+/// If the text is not `udp://HOST:PORT` or the host has no address.
+pub fn target(text: &str) -> Result<SocketAddr> {
+    let allowed = || format!("{text:?}: udp://HOST:PORT is allowed");
+    let mut found = text.strip_prefix("udp://").with_context(allowed)?.to_socket_addrs().with_context(allowed)?;
+    found.next().with_context(|| format!("{text:?}: the host has no address"))
 }
 
 /// Counts of what was sent, with the time that it took.

@@ -6,10 +6,11 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use mcap::records::{AttachmentHeader, Metadata, Record};
-use mcap::{Attachment, Compression, McapError, WriteOptions};
+use mcap::{Attachment, Compression, McapError, McapResult, WriteOptions, Writer};
 use serde_json::{Value, json};
 
 use super::damage::Damage;
+use super::header::Header;
 use super::mcap_file::CHUNK_NS;
 use super::mcap_reader::{McapReadError, McapReader, REPAIR_LOST_KEY, REPAIR_METADATA};
 use crate::file_advice::advised;
@@ -115,56 +116,17 @@ pub fn repair(input: &Path, output: &Path) -> Result<Report, RepairError> {
 /// Copies all records; returns the report, or an error if there was no message.
 fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, RepairError> {
     let failed = |source| RepairError::Write { file: output.to_owned(), source };
-    let mut writer = WriteOptions::new()
-        .profile("")
-        .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
-        .compression(Some(Compression::Zstd))
-        .compression_threads(0)
-        .create(BufWriter::new(file))
-        .map_err(failed)?;
-    let mut report = Report::default();
-    let (mut damages, mut chunk_ns) = (0, 0);
-    // Ids of the damaged file -> ids of the new one.
-    let (mut schemas, mut channels) = (BTreeMap::from([(0, 0)]), BTreeMap::new());
+    let mut copy = RecordCopy::new(file).map_err(failed)?;
+    let mut damages = 0;
     while let Some(record) = reader.next_record()? {
         // Only the message behind a damaged part decides what was lost with it.
         if matches!(record, Record::Message { .. }) && reader.damage_count() > damages {
-            for lost in losses(&reader.damages()[damages..]) {
-                writer.write_metadata(&lost_here(lost)).map_err(failed)?;
-            }
+            copy.note_losses(losses(&reader.damages()[damages..])).map_err(failed)?;
             damages = reader.damage_count();
         }
-        let copied = match record {
-            Record::Schema { header, data } => {
-                let id = writer.add_schema(&header.name, &header.encoding, &data);
-                id.map(|id| _ = schemas.insert(header.id, id))
-            }
-            Record::Channel(channel) => {
-                let schema = schemas.get(&channel.schema_id).copied().unwrap_or_default();
-                let id = writer.add_channel(schema, &channel.topic, &channel.message_encoding, &channel.metadata);
-                id.map(|id| _ = channels.insert(channel.id, id))
-            }
-            Record::Message { mut header, data } => match channels.get(&header.channel_id) {
-                Some(id) => {
-                    header.channel_id = *id;
-                    report.messages += 1;
-                    if header.log_time.abs_diff(chunk_ns) >= CHUNK_NS {
-                        writer.flush().map_err(failed)?;
-                        chunk_ns = header.log_time;
-                    }
-                    writer.write_to_known_channel(&header, &data)
-                }
-                None => Ok(()),
-            },
-            Record::Metadata(metadata) => writer.write_metadata(&reader.header().with_known_format(metadata)),
-            Record::Attachment { header, data, .. } => {
-                let AttachmentHeader { log_time, create_time, name, media_type } = header;
-                writer.attach(&Attachment { log_time, create_time, name, media_type, data })
-            }
-            _ => Ok(()),
-        };
-        copied.map_err(failed)?;
+        copy.write(record, reader.header()).map_err(failed)?;
     }
+    let mut report = Report { messages: copy.messages, ..Report::default() };
     (report.lost_messages, report.has_all_records) = (reader.lost_messages(), reader.has_all_records());
     (report.damages, report.incomplete) = (reader.damages(), reader.incomplete());
     if report.messages == 0 {
@@ -177,24 +139,83 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
     if reader.is_loss_at_end() {
         at_end.extend(reader.faults_of_end());
     }
-    for lost in at_end {
-        writer.write_metadata(&lost_here(lost)).map_err(failed)?;
-    }
-    writer.finish().map_err(failed)?;
-    let file = writer.into_inner().into_inner().map_err(|error| failed(McapError::Io(error.into_error())))?;
-    file.sync_all().map_err(|error| failed(McapError::Io(error)))?;
+    copy.note_losses(at_end).and_then(|()| copy.finish()).map_err(failed)?;
     Ok(report)
+}
+
+/// The new file, while records are copied to it.
+struct RecordCopy {
+    writer: Writer<BufWriter<File>>,
+    /// Ids of the damaged file -> ids of the new one.
+    schemas: BTreeMap<u16, u16>,
+    channels: BTreeMap<u16, u16>,
+    messages: u64,
+    /// Time of the message with which the newest chunk began.
+    chunk_ns: u64,
+}
+
+impl RecordCopy {
+    fn new(file: File) -> McapResult<Self> {
+        let writer = WriteOptions::new()
+            .profile("")
+            .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
+            .compression(Some(Compression::Zstd))
+            .compression_threads(0)
+            .create(BufWriter::new(file))?;
+        Ok(Self { writer, schemas: BTreeMap::from([(0, 0)]), channels: BTreeMap::new(), messages: 0, chunk_ns: 0 })
+    }
+
+    fn write(&mut self, record: Record<'_>, header: &Header) -> McapResult<()> {
+        match record {
+            Record::Schema { header, data } => {
+                let id = self.writer.add_schema(&header.name, &header.encoding, &data)?;
+                self.schemas.insert(header.id, id);
+            }
+            Record::Channel(channel) => {
+                let schema = self.schemas.get(&channel.schema_id).copied().unwrap_or_default();
+                let (topic, encoding) = (&channel.topic, &channel.message_encoding);
+                let id = self.writer.add_channel(schema, topic, encoding, &channel.metadata)?;
+                self.channels.insert(channel.id, id);
+            }
+            Record::Message { mut header, data } => {
+                let Some(id) = self.channels.get(&header.channel_id) else { return Ok(()) };
+                header.channel_id = *id;
+                self.messages += 1;
+                if header.log_time.abs_diff(self.chunk_ns) >= CHUNK_NS {
+                    self.writer.flush()?;
+                    self.chunk_ns = header.log_time;
+                }
+                self.writer.write_to_known_channel(&header, &data)?;
+            }
+            Record::Metadata(metadata) => self.writer.write_metadata(&header.with_known_format(metadata))?,
+            Record::Attachment { header, data, .. } => {
+                let AttachmentHeader { log_time, create_time, name, media_type } = header;
+                self.writer.attach(&Attachment { log_time, create_time, name, media_type, data })?;
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Writes what is lost at this place.
+    fn note_losses(&mut self, lost: Vec<String>) -> McapResult<()> {
+        lost.into_iter().try_for_each(|lost| {
+            let metadata = BTreeMap::from([(REPAIR_LOST_KEY.to_owned(), lost)]);
+            self.writer.write_metadata(&Metadata { name: REPAIR_METADATA.into(), metadata })
+        })
+    }
+
+    /// Ends the file, and returns when the disk has it.
+    fn finish(mut self) -> McapResult<()> {
+        self.writer.finish()?;
+        let file = self.writer.into_inner().into_inner().map_err(|error| error.into_error())?;
+        Ok(file.sync_all()?)
+    }
 }
 
 /// The texts of the damages that are losses.
 fn losses(damages: &[Damage]) -> Vec<String> {
     damages.iter().filter(|damage| damage.is_loss).map(ToString::to_string).collect()
-}
-
-/// The metadata at the place of a loss.
-fn lost_here(lost: String) -> Metadata {
-    let metadata = BTreeMap::from([(REPAIR_LOST_KEY.to_owned(), lost)]);
-    Metadata { name: REPAIR_METADATA.into(), metadata }
 }
 
 /// Reads the new file from its start to its end.

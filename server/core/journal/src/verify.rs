@@ -146,70 +146,18 @@ pub fn verify(mut recording: RecordingReader, vehicles: Vec<RecordedVehicle>) ->
     let beginning = if has_maps { Beginning::of(recording.file())? } else { Beginning::default() };
     let stated_boot_id = recording.header().boot_id;
     let boot_id = beginning.boot_id.unwrap_or(stated_boot_id);
-    let mut replays = Vec::new();
     let is_first_part = recording.part().map_or(beginning.first_event == Some(0), |part| part == 1);
-    for RecordedVehicle { config, tables } in vehicles {
-        let pipeline = Pipeline::new(&config, tables.clone())?;
-        replays.push(VehicleReplay {
-            name: config.name.as_str().into(),
-            tables,
-            pipeline: is_first_part.then_some(pipeline),
-            warm_up: None,
-            valid_ms: config.maps.valid_ms,
-            config,
-            records: recording.maps(),
-            next_event: is_first_part.then_some(0),
-            lacks_events: false,
-            computed: BTreeMap::new(),
-            extra: BTreeSet::new(),
-        });
-    }
+    let replay = |vehicle| VehicleReplay::new(vehicle, recording.maps(), is_first_part);
+    let mut replays = vehicles.into_iter().map(replay).collect::<Result<Vec<_>, _>>()?;
     let made_by = recording.header().value("version").to_owned();
     let mut report = Report { recorded: recording.maps(), made_by, ..Report::default() };
     let mut losses = 0;
     while let Some(message) = recording.next() {
         let losses_before = std::mem::replace(&mut losses, recording.loss_count());
         if losses > losses_before {
-            for replay in &mut replays {
-                // The damaged part may have had the maps of the newest event.
-                replay.lacks_events = true;
-                report.unjudged += std::mem::take(&mut replay.computed).len() as u64;
-            }
+            replays.iter_mut().for_each(|replay| replay.lose_events(&mut report));
         }
-        match message? {
-            RecordedMessage::Event { vehicle, event } => {
-                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
-                report.events += 1;
-                replay.step(&event, boot_id, &mut report);
-            }
-            RecordedMessage::Keyframe { vehicle, keyframe } => {
-                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
-                replay.apply(&keyframe)?;
-            }
-            RecordedMessage::Counts(counts) => {
-                if let Some(topic) = counts.topics.iter().find(|topic| topic.dropped > 0) {
-                    report.dropped = counts.topics.iter().map(|topic| topic.dropped).sum();
-                    report.dropped_because = format!("{}: {}", topic.topic, counts.reason);
-                }
-                report.is_closed |= counts.closed;
-            }
-            RecordedMessage::Map { vehicle, layer, bytes } => {
-                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else {
-                    report.add(&vehicle, sequence_and_cells(&bytes).0, &layer, DifferenceKind::Extra);
-                    continue;
-                };
-                replay.compare(&layer, &bytes, &mut report);
-            }
-            RecordedMessage::Digest { vehicle, layer, digest } => {
-                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else {
-                    let sequence = digest.header.map_or(u64::MAX, |header| header.sequence);
-                    report.add(&vehicle, sequence, &layer, DifferenceKind::Extra);
-                    continue;
-                };
-                replay.compare_digest(&layer, digest, &mut report);
-            }
-            RecordedMessage::Ros { .. } => {}
-        }
+        replay_message(&mut replays, message?, boot_id, &mut report)?;
     }
     report.cut = recording.is_cut();
     report.damages = recording.damages();
@@ -232,7 +180,71 @@ pub fn verify(mut recording: RecordingReader, vehicles: Vec<RecordedVehicle>) ->
     Ok(report)
 }
 
+/// Steps or compares the vehicle of a message. A map of an unknown vehicle is a difference.
+fn replay_message(
+    replays: &mut [VehicleReplay],
+    message: RecordedMessage,
+    boot_id: u64,
+    report: &mut Report,
+) -> Result<(), ConfigValueError> {
+    let of = |vehicle: &str| replays.iter().position(|replay| *replay.name == *vehicle);
+    match message {
+        RecordedMessage::Event { vehicle, event } => {
+            let Some(index) = of(&vehicle) else { return Ok(()) };
+            report.events += 1;
+            replays[index].step(&event, boot_id, report);
+        }
+        RecordedMessage::Keyframe { vehicle, keyframe } => {
+            of(&vehicle).map_or(Ok(()), |index| replays[index].apply(&keyframe))?;
+        }
+        RecordedMessage::Counts(counts) => {
+            if let Some(topic) = counts.topics.iter().find(|topic| topic.dropped > 0) {
+                report.dropped = counts.topics.iter().map(|topic| topic.dropped).sum();
+                report.dropped_because = format!("{}: {}", topic.topic, counts.reason);
+            }
+            report.is_closed |= counts.closed;
+        }
+        RecordedMessage::Map { vehicle, layer, bytes } => match of(&vehicle) {
+            Some(index) => replays[index].compare(&layer, &bytes, report),
+            None => report.add(&vehicle, sequence_and_cells(&bytes).0, &layer, DifferenceKind::Extra),
+        },
+        RecordedMessage::Digest { vehicle, layer, digest } => match of(&vehicle) {
+            Some(index) => replays[index].compare_digest(&layer, digest, report),
+            None => {
+                let sequence = digest.header.map_or(u64::MAX, |header| header.sequence);
+                report.add(&vehicle, sequence, &layer, DifferenceKind::Extra);
+            }
+        },
+        RecordedMessage::Ros { .. } => {}
+    }
+    Ok(())
+}
+
 impl VehicleReplay {
+    fn new(vehicle: RecordedVehicle, records: RecordedMaps, is_first_part: bool) -> Result<Self, ConfigValueError> {
+        let RecordedVehicle { config, tables } = vehicle;
+        let pipeline = Pipeline::new(&config, tables.clone())?;
+        Ok(Self {
+            name: config.name.as_str().into(),
+            tables,
+            pipeline: is_first_part.then_some(pipeline),
+            warm_up: None,
+            valid_ms: config.maps.valid_ms,
+            config,
+            records,
+            next_event: is_first_part.then_some(0),
+            lacks_events: false,
+            computed: BTreeMap::new(),
+            extra: BTreeSet::new(),
+        })
+    }
+
+    /// Takes note of a damaged part, which may have had the maps of the newest event.
+    fn lose_events(&mut self, report: &mut Report) {
+        self.lacks_events = true;
+        report.unjudged += std::mem::take(&mut self.computed).len() as u64;
+    }
+
     /// Begins a pipeline for the keyframe, or lets it make the maps from here on.
     fn apply(&mut self, keyframe: &v1::Keyframe) -> Result<(), ConfigValueError> {
         match keyframe.phase() {

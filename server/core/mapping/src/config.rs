@@ -5,7 +5,7 @@
 //! key, its value and what is allowed. Lengths are in metres. Angles are in degrees here, and in radians in all other
 //! modules.
 //!
-//! Each stage owns its table; this module has the tables of the whole vehicle, and names those of the stages.
+//! Each stage owns its table; this module has the tables of the whole vehicle, and names the tables of the stages.
 //!
 //! | table | where |
 //! |---|---|

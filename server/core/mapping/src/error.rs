@@ -56,7 +56,7 @@ pub enum EventError {
         /// Number of points of the scan.
         points: usize,
     },
-    /// A ring of a scan is one that the configured model does not have.
+    /// A scan has a ring that the configured model does not have.
     #[error(
         "scan with ring {ring}: the configured model {model} has {lasers} lasers, so 0 to {} is allowed; set the \
          sensor's `model` to the one that sends the scans, or remove it",

@@ -16,8 +16,8 @@ pub struct Event {
     pub sequence: u64,
     /// Time at which the event queue accepted the event, ns since the Unix epoch, host clock.
     pub arrival_ns: i64,
-    /// Index of the sensor: first those of the configuration, then the declared ones. 0 if the body concerns the whole
-    /// vehicle.
+    /// Index of the sensor: first the sensors of the configuration, then the declared sensors. 0 if the body concerns
+    /// the whole vehicle.
     pub source: u16,
     /// The reading or message.
     pub body: Body,

@@ -3,14 +3,14 @@
 //! In: arrival times of events, as the host's clock gave them. Out: [`EventTime`], which never runs backwards.
 //!
 //! Events of different sources may be out of order: the kernel stamps a datagram when it arrives, an observation is
-//! stamped when it is read, and a server that stood still reads the datagrams of one socket after those of another. The
-//! arrivals of one source and kind (a *lane*) are in order, unless the host's clock is set back.
+//! stamped when it is read, and a server that stood still reads the datagrams of one socket after the datagrams of
+//! another socket. The arrivals of one source and kind (a *lane*) are in order, unless the host's clock is set back.
 //!
 //! | arrival | event time |
 //! |---|---|
 //! | later than all arrivals before | advances by the difference |
-//! | earlier, but not earlier than the one before in its lane | stays: the event was read late |
-//! | earlier than the one before in its lane, or by more than 10 s than any | stays; later arrivals count from it |
+//! | earlier, but not earlier than the arrival before in its lane | stays: the event was read late |
+//! | earlier than the arrival before in its lane, or by more than 10 s than any | stays; later arrivals count from it |
 
 use std::collections::BTreeMap;
 

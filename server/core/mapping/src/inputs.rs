@@ -154,7 +154,7 @@ impl Inputs {
         &self.roads
     }
 
-    /// Number of indices of sensors, those of withdrawn sensors included.
+    /// Number of indices of sensors, with the indices of withdrawn sensors.
     pub fn sources(&self) -> usize {
         self.sensors.len()
     }
@@ -234,7 +234,7 @@ impl Inputs {
         }
     }
 
-    /// Begins the pipeline of the sensor `index`, in place of the one before.
+    /// Begins the pipeline of the sensor `index`, in place of the pipeline before.
     fn begin_sensor(&mut self, index: usize, calibration: Option<Calibration>) {
         let sensor = &self.config.sensors[index];
         let pipeline = SensorPipeline::new(

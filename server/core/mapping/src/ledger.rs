@@ -183,7 +183,7 @@ impl Ledgers {
         });
     }
 
-    /// Changes the ledger of the vehicle, and the one of the sensor if there is such a sensor.
+    /// Changes the ledger of the vehicle, and the ledger of the sensor if there is such a sensor.
     fn each(&mut self, source: u16, record: impl Fn(&mut Ledger)) {
         record(&mut self.vehicle);
         if let Some(sensor) = self.sensors.get_mut(usize::from(source)) {

@@ -18,8 +18,8 @@ pub struct Map {
     /// Stamp of the source's last firing, ns since the Unix epoch. All points are expressed in the ego frame of this
     /// stamp, and the age of the map counts from it.
     pub capture_end_ns: i64,
-    /// Number of the epoch of `capture_end_ns`: how often it was not later than that of the map before. Within an epoch
-    /// it rises.
+    /// Number of the epoch of `capture_end_ns`: how often it was not later than the `capture_end_ns` of the map before.
+    /// Within an epoch it rises.
     pub epoch: u32,
     /// Arrival of the event that completed the map, ns since the Unix epoch, host clock.
     pub completed_ns: i64,
@@ -29,9 +29,9 @@ pub struct Map {
     pub speed_mps: Option<f64>,
     /// What moved the points to `capture_end_ns`; the weakest of all contributing sensors.
     pub compensation: Compensation,
-    /// Index of the sensor whose scan made the map: the reference sensor, or one that replaces it.
+    /// Index of the sensor whose scan made the map: the reference sensor, or a sensor that replaces it.
     pub source: u16,
-    /// Index of the reference sensor: the configured one, else the one that was chosen.
+    /// Index of the reference sensor: the configured sensor, else the chosen sensor.
     pub reference_sensor: u16,
     /// Every sensor of the vehicle by index, whether it contributes or not. One without a name was withdrawn.
     pub sensors: Vec<SensorState>,
@@ -40,7 +40,7 @@ pub struct Map {
 }
 
 impl Map {
-    /// The sensors but those that were withdrawn.
+    /// The sensors without the withdrawn sensors.
     pub fn present_sensors(&self) -> impl Iterator<Item = &SensorState> {
         self.sensors.iter().filter(|sensor| !sensor.name.is_empty())
     }

@@ -22,7 +22,7 @@ pub(crate) struct MapGround {
     estimates: Option<Estimates>,
     /// True once the ground of a map was estimated.
     is_known: bool,
-    /// Sensor and number of the scan whose points alone are those of the map; `None` for a map of several.
+    /// Sensor and number of the scan whose points are all the points of the map; `None` for a map of several scans.
     sole_scan: Option<(u16, u64)>,
     /// Heights of the newest scan's points over the ground, metres.
     scan_heights_m: Vec<f32>,

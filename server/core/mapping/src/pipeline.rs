@@ -55,7 +55,7 @@ pub struct NamedStatus {
     pub source: u16,
     /// Name of the sensor in the configuration.
     pub name: String,
-    /// True if it is the reference sensor: the configured one, else the one that was chosen.
+    /// True if it is the reference sensor: the configured sensor, else the chosen sensor.
     pub is_reference: bool,
     /// Status found from the sensor's data; a scan event counts as a revolution.
     pub status: SensorStatus,
@@ -69,7 +69,7 @@ pub struct NamedStatus {
     pub ledger: Ledger,
 }
 
-/// What a pipeline takes over from the one that it replaces: the numbers that go on.
+/// What a pipeline takes over from the pipeline that it replaces: the numbers that go on.
 #[derive(Clone, Debug)]
 pub struct Handover {
     /// Sequence of the next map.
@@ -94,7 +94,7 @@ impl Handover {
 
 impl Pipeline {
     /// A pipeline before the first event, with all enabled layers active. `calibrations[i]` is the table of
-    /// `config.sensors[i].calibration`; `None` selects the factory's table, or the one in the sensor's status bytes.
+    /// `config.sensors[i].calibration`; `None` selects the factory's table, or the table in the sensor's status bytes.
     ///
     /// # Errors
     /// [`ConfigValueError`] for the first value that is not allowed, or if there are not as many calibrations as
@@ -221,8 +221,8 @@ impl Pipeline {
         Handover { next_map: self.maps_made, newest, ledgers: self.ledgers.clone() }
     }
 
-    /// Replaces another pipeline: the next map gets its number, and stamps and counts go on from those of the other.
-    /// All else follows from the events that this pipeline has processed itself.
+    /// Replaces another pipeline: the next map gets its number, and stamps and counts go on from the other's. All else
+    /// follows from the events that this pipeline has processed itself.
     pub fn take_over(&mut self, handover: Handover) {
         let sensors = self.inputs.sources();
         self.maps_made = handover.next_map;
@@ -319,7 +319,8 @@ impl Pipeline {
         }
     }
 
-    /// Index of the reference sensor: the configured one, else the one that is chosen from the sensors and their scans.
+    /// Index of the reference sensor: the configured sensor, else the sensor that is chosen from the sensors and their
+    /// scans.
     pub fn reference_sensor(&self) -> usize {
         self.fusion.reference_sensor()
     }

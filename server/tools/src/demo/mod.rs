@@ -6,10 +6,12 @@
 //! | [`run`] | [`DemoOptions`] -> a server, a car, reports |
 //! | [`sensors`] | the choice of sensors, this machine -> the model on the roof |
 //! | [`rig`] | scene, sensors -> the vehicle's configuration, datagrams, observations |
+//! | `fleet` | sensors, a server -> the cars that drive at it |
 //! | [`car`] | rig, clock -> UDP and gRPC in real time |
 //! | [`report`] | status -> a line |
 
 pub mod car;
+mod fleet;
 pub mod report;
 pub mod rig;
 pub mod run;

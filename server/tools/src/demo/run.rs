@@ -4,27 +4,29 @@ use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
-use clearway_sim::scenes::town;
 use clearway_sim::send::Sent;
-use clearway_sim::traffic::street;
-use tokio::time::MissedTickBehavior;
+use tokio::time::{Instant, MissedTickBehavior};
 
 use clearway_daemon::base::clock::now_ns;
 use clearway_daemon::config::{Config, Sender, Udp, Vehicle};
+use clearway_daemon::engine::newest::Newest;
 use clearway_daemon::run::{Running, Server, Setup};
 use clearway_daemon::status::process;
 use clearway_journal::RecordedMaps;
 use clearway_journal::encode::EncodedMap;
 
-use super::car::{self, DemoCar};
+use super::car;
+use super::fleet::{DemoFleet, NOWHERE, name, rig};
 use super::report::{DemoReport, DemoSummary};
 use super::rig::{self, Rig};
 use super::sensors::{self, DemoSensors, SensorChoice};
 use crate::picture::{self, PictureStyle};
 
+/// How long the demo runs if no duration is given: a century.
+const ENDLESS: Duration = Duration::from_secs(100 * 365 * 86_400);
 /// How long the demo waits at its end for the last datagrams, which take far less to pass through the sockets.
 const SETTLE: Duration = Duration::from_millis(500);
 /// Greatest length of a recording in MiB, beyond which its oldest parts are deleted. Ours: a quarter of an hour with an
@@ -32,14 +34,6 @@ const SETTLE: Duration = Duration::from_millis(500);
 pub const RECORDING_MIB: u64 = 2048;
 /// As [`RECORDING_MIB`], of a black box.
 pub const BLACK_BOX_MIB: u64 = 256;
-/// The names of a fleet's vehicles; further vehicles have numbers.
-const NAMES: [&str; 5] = ["car", "van", "truck", "bus", "shuttle"];
-/// From one vehicle of a fleet to the next along its course, in metres.
-const APART_M: f64 = 45.0;
-/// The vehicle of a fleet that fails, how long it drives, and how long it stands still then, over and over.
-const FAILING: usize = 1;
-const DRIVES: Duration = Duration::from_secs(60);
-const FAILS: Duration = Duration::from_secs(20);
 
 /// Options of a demo.
 #[derive(Clone, Debug, Default)]
@@ -92,103 +86,46 @@ pub async fn demo(
     let (config, notes) = configuration(&options, &rig(sensors, &choice, 0));
     let validity = Duration::from_millis(config.vehicles[0].maps.valid_ms.into());
     let running = Server::start(Setup { config, ..Setup::default() }).await?;
-    let nowhere = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-    begun(&DemoEndpoints {
-        page: running.page.unwrap_or(nowhere),
-        grpc: running.grpc.unwrap_or(nowhere),
-        zenoh: running.zenoh.clone(),
-        sensors: describe(sensors, &choice),
-        notes,
-    });
+    begun(&endpoints(&running, describe(sensors, &choice), notes));
     let served = running.vehicles.0[0].clone();
     // The picture and the line need these layers, whether or not a reader subscribes to them.
     let _subscription = served.wires.subscriptions.subscribe(&["freespace".to_owned(), "drivability".to_owned()]);
-    let start = |index: usize, driven: Duration| {
-        let mut rig = rig(sensors, &choice, now_ns());
-        let drive = &mut rig.scene.drive;
-        drive.start = drive.station(driven.as_secs_f64()) + APART_M * index as f64;
-        let udp = running.inputs[index].udp.unwrap_or((nowhere, nowhere));
-        let newest = &running.vehicles.0[index].newest;
-        DemoCar::start(&name(index), rig, udp, running.grpc.unwrap_or(nowhere), newest).context("the simulated car")
-    };
     // The cars start after everything else, so that their first firings are now.
-    let first: Result<Vec<_>> = (0..count).map(|index| start(index, Duration::ZERO).map(Some)).collect();
-    let (mut cars, mut sent) = (first?, Sent::default());
+    let mut fleet = DemoFleet::start(&running, sensors, &choice, count)?;
     let cpu_s = || process::read().cpu_s;
     let cpu_before_s = cpu_s();
 
-    let began = tokio::time::Instant::now();
-    let end = async {
-        match options.duration {
-            Some(duration) => tokio::time::sleep_until(began + duration).await,
-            None => std::future::pending().await,
-        }
-    };
+    let began = Instant::now();
+    let end = tokio::time::sleep_until(began + options.duration.unwrap_or(ENDLESS));
     tokio::pin!(stop, end);
     let sensors = if sensors == DemoSensors::Many { "eight sensors" } else { sensors::name(choice.model) };
     let mut last = DemoReport { validity, sensors, ..DemoReport::default() };
-    let now = |running: &Running, last: &DemoReport, cars: &[Option<DemoCar>]| {
-        let snapshot = running.vehicles.0[0].status.snapshot();
+    let now = |last: &DemoReport, fleet: &DemoFleet<'_>| {
+        let snapshot = served.status.snapshot();
         let age_ms = (snapshot.maps > 0).then(|| (now_ns() - snapshot.newest_capture_end_ns) as f64 / 1e6);
-        last.next(
-            began.elapsed(),
-            snapshot,
-            age_ms,
-            cars.iter().flatten().map(DemoCar::skipped).max().unwrap_or_default(),
-        )
+        last.next(began.elapsed(), snapshot, age_ms, fleet.skipped())
     };
     let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
     every.set_missed_tick_behavior(MissedTickBehavior::Skip);
     let mut is_undrawn = false;
-    loop {
+    while !fleet.has_stopped() {
         tokio::select! {
             biased;
             () = &mut stop => break,
             () = &mut end => break,
             _ = every.tick() => {
-                last = now(&running, &last, &cars);
+                last = now(&last, &fleet);
                 report(&last);
-                if let Some(failing) = cars.get_mut(FAILING) {
-                    let elapsed = began.elapsed();
-                    let drives = elapsed.as_secs() % (DRIVES + FAILS).as_secs() < DRIVES.as_secs();
-                    if drives && failing.is_none() {
-                        *failing = Some(start(FAILING, elapsed)?);
-                    } else if !drives && let Some(car) = failing.take() {
-                        tracing::info!("{} fails, and comes back in {} s", name(FAILING), FAILS.as_secs());
-                        sent += car.stop().await?;
-                    }
-                }
-                let newest = served.newest.borrow().clone();
-                if let Some((map, picture)) = newest.zip(options.picture.as_deref()) {
-                    let drawn = tokio::task::block_in_place(|| draw(&map, picture));
-                    if let Err(error) = drawn && !std::mem::replace(&mut is_undrawn, true) {
-                        tracing::warn!("picture {}: {error:#}", picture.display());
-                    }
-                }
+                fleet.fail_in_turn(began.elapsed()).await?;
+                draw_newest(served.newest.borrow().clone(), options.picture.as_deref(), &mut is_undrawn);
             }
         }
-        if cars.iter().flatten().any(DemoCar::has_stopped) {
-            break;
-        }
     }
-    last = now(&running, &last, &cars);
+    last = now(&last, &fleet);
     let cores = cpu_s().zip(cpu_before_s).map(|(now_s, before_s)| (now_s - before_s) / last.elapsed.as_secs_f64());
-    let mut fault = None;
-    for car in cars.into_iter().flatten() {
-        match car.stop().await {
-            Ok(of_car) => sent += of_car,
-            Err(error) => fault = Some(error),
-        }
-    }
-    let vehicles = running.vehicles.clone();
-    let some_are_on_the_way = || {
-        let ledgers = vehicles.0.iter().map(|of| of.status.snapshot().ledger);
-        let accounted: u64 = ledgers.map(|ledger| ledger.received + ledger.lost + ledger.kernel_drops).sum();
-        accounted < sent.packets + sent.telemetry
-    };
-    let settled = tokio::time::Instant::now() + SETTLE;
-    while fault.is_none() && some_are_on_the_way() && tokio::time::Instant::now() < settled {
-        tokio::time::sleep(Duration::from_millis(5)).await;
+    let (sent, fault) = fleet.stop().await;
+    if fault.is_none() {
+        settle(&running, &sent).await;
     }
     running.shutdown().await?;
     fault.map_or(Ok(()), Err)?;
@@ -196,9 +133,33 @@ pub async fn demo(
     Ok(DemoSummary { last: DemoReport { snapshot: served.status.snapshot(), ..last }, sent, cores })
 }
 
-/// The name of the vehicle with this index.
-fn name(index: usize) -> String {
-    NAMES.get(index).map_or_else(|| format!("vehicle-{}", index + 1), |name| (*name).to_owned())
+fn endpoints(running: &Running, sensors: String, notes: Vec<String>) -> DemoEndpoints {
+    let [page, grpc] = [running.page, running.grpc].map(|at| at.unwrap_or(NOWHERE));
+    DemoEndpoints { page, grpc, zenoh: running.zenoh.clone(), sensors, notes }
+}
+
+/// Waits for the last datagrams, for [`SETTLE`] at most.
+async fn settle(running: &Running, sent: &Sent) {
+    let some_are_on_the_way = || {
+        let ledgers = running.vehicles.0.iter().map(|of| of.status.snapshot().ledger);
+        let accounted: u64 = ledgers.map(|ledger| ledger.received + ledger.lost + ledger.kernel_drops).sum();
+        accounted < sent.packets + sent.telemetry
+    };
+    let until = Instant::now() + SETTLE;
+    while some_are_on_the_way() && Instant::now() < until {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+/// Draws the newest map; the first failure is logged.
+fn draw_newest(newest: Newest, picture: Option<&Path>, is_undrawn: &mut bool) {
+    let Some((map, picture)) = newest.zip(picture) else { return };
+    let drawn = tokio::task::block_in_place(|| draw(&map, picture));
+    if let Err(error) = drawn
+        && !std::mem::replace(is_undrawn, true)
+    {
+        tracing::warn!("picture {}: {error:#}", picture.display());
+    }
 }
 
 /// Draws a map's free space. A reader of the file sees a whole picture, either the old or the new one.
@@ -208,14 +169,6 @@ fn draw(map: &EncodedMap, file: &Path) -> Result<()> {
     let unfinished = file.with_extension("png.part");
     std::fs::write(&unfinished, picture::png(&map.header, layer, &PictureStyle::default())?)?;
     Ok(std::fs::rename(&unfinished, file)?)
-}
-
-/// The car; its scene begins at `start_ns`.
-fn rig(sensors: DemoSensors, choice: &SensorChoice, start_ns: i64) -> Rig {
-    match sensors {
-        DemoSensors::Many => Rig::many(street(8.0), start_ns),
-        _ => Rig::one(choice.model, town(), start_ns),
-    }
 }
 
 fn describe(sensors: DemoSensors, choice: &SensorChoice) -> String {

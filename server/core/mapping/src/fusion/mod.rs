@@ -6,15 +6,16 @@
 //!
 //! - The source of a map is the first usable sensor in this order: the reference sensor, then the others as they are
 //!   configured. A sensor is not usable while it completes no scan for `deadline_ms` of event time, or while its scans
-//!   arrive that much later after their stamps (or that much earlier before them) than those of the timeliest sensor.
+//!   arrive that much later after their stamps (or that much earlier before them) than the scans of the timeliest
+//!   sensor.
 //! - A map waits for the scans of other sensors that are due with the same stamp: those whose stamp before, plus the
 //!   time between their last two stamps, is the map's stamp. It waits until they are there, until an event shows that a
 //!   quarter of `deadline_ms` has passed, or until the next scan makes a map. A vehicle with one sensor never waits.
 //! - A scan without points and rays makes no map and is in no map while another sensor is usable.
 //! - If no map was made for `deadline_ms` (for `period_ms` if that is more), the next timely scan of any sensor makes
 //!   one: no silent sensor holds back the maps.
-//! - The rows of radial maps are those of the reference sensor once it has completed a scan, whichever sensor is the
-//!   source. If a sensor has few lasers, a row may cover all the ground, and one return would make all of it drivable.
+//! - Radial maps have the rows of the reference sensor once it has completed a scan, whichever sensor is the source. If
+//!   a sensor has few lasers, a row may cover all the ground, and one return would make all of it drivable.
 //! - A scan whose end is more than `deadline_ms` away from the map's stamp is not in the map. The map names its sensor
 //!   with the age of the scan.
 //!
@@ -98,7 +99,7 @@ pub(crate) struct MergedScans {
     pub sensors: Vec<SensorState>,
     /// Points, ego frame at `end_ns`.
     pub sweep: Arc<Sweep>,
-    /// Number of the source's scan if its points alone are those of the map; `None` for a map of several scans.
+    /// Number of the source's scan if its points are all the points of the map; `None` for a map of several scans.
     pub sole_scan: Option<u64>,
 }
 
@@ -237,7 +238,7 @@ impl Fusion {
         (0..scans.len()).filter(|index| *index != source).filter(is_due).collect()
     }
 
-    /// True if the sensor's scans arrive no later after their stamps, nor earlier before them, than those of the
+    /// True if the sensor's scans arrive no later after their stamps, nor earlier before them, than the scans of the
     /// timeliest fresh sensor, with the deadline as tolerance. A scan that is not timely no longer describes the scene.
     pub fn is_timely(&self, source: usize, scans: &[SensorScan], now: EventTime) -> bool {
         let delay_ns = |scan: &SensorScan| scan.completed_at.arrival_ns.saturating_sub(scan.end_ns).saturating_abs();

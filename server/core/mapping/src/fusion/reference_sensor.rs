@@ -17,8 +17,8 @@ const SECTORS: u32 = 12;
 /// Least number of directions in which a sensor that sees all around has returns. Ours: an open side has none.
 const SECTORS_ALL_AROUND: u32 = 9;
 
-/// Properties by which sensors are compared, the most important first; of two equal sensors the one configured first is
-/// chosen.
+/// Properties by which sensors are compared, the most important first; of two equal sensors the sensor configured first
+/// is chosen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Merits {
     /// False if the sensor was withdrawn.
@@ -164,7 +164,7 @@ mod tests {
         };
         let at = |event_ns| EventTime { event_ns, ..EventTime::default() };
         let mut choice = ReferenceChoice::new(false, 2, 100);
-        // Two configured sensors, and a declared one that sees more.
+        // Two configured sensors, and a declared sensor that sees more.
         let silent = || scan(0.0, 0);
         assert_eq!(choice.by_scans(&[silent(), silent(), seen(12)], at(0)), None);
         assert_eq!(choice.by_scans(&[silent(), silent(), seen(12)], at(101)), Some(2));

@@ -14,8 +14,8 @@ const RANGE_M_MAX: f32 = 15.0;
 /// Least height of seen ground over the ray, metres, and its largest height over the estimate. Ours; not tuned.
 const OVER_RAY_M: f32 = 0.1;
 const GROUND_M_MAX: f32 = 0.1;
-/// Number of cells in which ground over the ray is seen, in the column of the return and in the one to each side. Ours:
-/// the edge of a ditch that runs along the ray fills one side.
+/// Number of cells in which ground over the ray is seen, in the column of the return and in the column to each side.
+/// Ours: the edge of a ditch that runs along the ray fills one side.
 const SEEN_MIN: usize = 2;
 
 /// True if the ray of a return of a column passes under ground that was seen. The return lies at this height over the

@@ -183,7 +183,7 @@ impl Ground {
         self.nodes.extend_from_within(ROWS * WIDTH..);
     }
 
-    /// Height of the ground at a position, metres; that of the near plane where no ground was seen.
+    /// Height of the ground at a position, metres; the height of the near plane where no ground was seen.
     pub fn height_m(&self, x: f32, y: f32) -> f32 {
         self.look_up(x, y, self.cells.coordinates(x, y)).0
     }

@@ -8,10 +8,10 @@ use super::neighbourhood::Neighbourhood;
 use super::plane::NearPlane;
 use super::polar::{CELLS, COLUMNS, ROWS, beside, column_directions, row_middles_m, row_start_m};
 
-/// Where a height of the surface comes from; each is more certain than the one before.
+/// Where a height of the surface comes from; each source is more certain than the source before.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Confidence {
-    /// No ground was seen near; the height is that of the near plane, and proves nothing free.
+    /// No ground was seen near; the height is the near plane's, and proves nothing free.
     #[default]
     None,
     /// Beyond the edge of seen ground, by up to [`EXTRAPOLATED_M_MAX`].
@@ -69,7 +69,7 @@ impl Surface {
         &self.confidences
     }
 
-    /// Replaces the surface by that of the ground found.
+    /// Replaces the surface by the surface of the ground found.
     pub fn cover(&mut self, growth: &Growth, plane: &NearPlane) {
         self.heights_m.copy_from_slice(growth.heights_m());
         self.remove_standing_cells();

@@ -12,7 +12,7 @@ pub struct Channel {
     pub unit: &'static str,
     /// Factor from a raw value to a value in `unit`.
     pub scale: f32,
-    /// Raw value of a cell of which nothing is known.
+    /// Raw value of a cell about which nothing is known.
     pub unknown: i32,
     /// Raw values, in the order of the layer's grid.
     pub cells: Cells,
@@ -71,7 +71,7 @@ pub struct TypedChannel<T> {
     pub unit: &'static str,
     /// As [`Channel::scale`].
     pub scale: f32,
-    /// Raw value of a cell of which nothing is known.
+    /// Raw value of a cell about which nothing is known.
     pub unknown: T,
 }
 
@@ -110,7 +110,7 @@ impl<T: CellType> TypedChannel<T> {
         channel.map_or(Vec::new(), |channel| T::take_values(&mut channel.cells))
     }
 
-    /// Puts this channel with new raw values into a layer, in place of the one it had.
+    /// Puts this channel with new raw values into a layer, in place of the channel that it had.
     pub fn store(&self, channels: &mut Vec<Channel>, values: Vec<T>) {
         match channels.iter_mut().find(|channel| channel.name == self.name) {
             Some(channel) => *channel = self.with_values(values),

@@ -28,9 +28,9 @@ pub enum Geometry {
         height: u32,
         /// Side of a cell, metres.
         cell_m: f32,
-        /// Heading of the ego frame in the grid's axes, radians; 0 if the grid's axes are those of the vehicle.
+        /// Heading of the ego frame in the grid's axes, radians; 0 if the grid has the vehicle's axes.
         yaw_rad: f64,
-        /// Index (x, y) of cell (0, 0) in the world's grid; 0 if the grid's axes are those of the vehicle.
+        /// Index (x, y) of cell (0, 0) in the world's grid; 0 if the grid has the vehicle's axes.
         first_cell: [i64; 2],
     },
 }

@@ -133,7 +133,7 @@ impl<'a> Context<'a> {
     }
 }
 
-/// A copy of a maker of which only the trait is known.
+/// A copy of a maker whose trait alone is known.
 pub trait CloneMaker {
     /// A copy with the same evidence.
     fn cloned(&self) -> Box<dyn LayerMaker>;

@@ -9,7 +9,7 @@
 //! | [`radial_grid`] | r-θ grid: position -> cell |
 //! | [`roughness`] | deviations of the points -> roughness by cell, for `terrain` and `speed` |
 //! | `own_outline` | no cell in the vehicle's outline is occupied |
-//! | `registry` | the list of the seven; which of them are active |
+//! | `registry` | the list of the seven layers; which layers are active |
 //! | [`freespace`] | where the whole vehicle can drive: the layer to plan on; not in the papers |
 //! | [`drivability`] | UT Austin thesis, section IV |
 //! | [`height_difference`] | UT Austin thesis, section V: the baseline |

@@ -58,7 +58,7 @@ pub fn clear(layer: &mut Layer, outline: &Outline) {
                 for ix in near(*origin_x_m, width) {
                     let centre = |origin_m: f64, index: usize| origin_m + (index as f64 + 0.5) * cell_m;
                     let [x, y] = [centre(*origin_x_m, ix), centre(*origin_y_m, iy)];
-                    // From the grid's axes to those of the vehicle.
+                    // From the grid's axes to the vehicle's axes.
                     let is_own = || outline.contains((cos * x + sin * y) as f32, (cos * y - sin * x) as f32);
                     clear(iy * width + ix, &is_own);
                 }

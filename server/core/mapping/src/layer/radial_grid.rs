@@ -182,7 +182,7 @@ impl RadialGrid {
         let mut cells = [0u32; CHUNK];
         let columns = self.columns() as u32;
         let ratio = f32::from(self.azimuths.columns) / f32::from(AzimuthColumns::TWO_DEGREES);
-        // The product with a power of two is exact, so that the columns are those of the position itself.
+        // The product with a power of two is exact, so that the position itself has the same columns.
         let azimuths = azimuths.filter(|_| ratio.to_bits() & 0x007f_ffff == 0 && self.is_about_origin());
         let [centre_x, centre_y] = self.centre_m;
         for (index, (x, y)) in sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).enumerate() {

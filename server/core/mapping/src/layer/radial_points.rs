@@ -33,7 +33,7 @@ impl RadialPoints {
         self.size
     }
 
-    /// Replaces the points by those of a sweep. `azimuths`: see [`RadialGrid::for_each_chunk`].
+    /// Replaces the points by the points of a sweep. `azimuths`: see [`RadialGrid::for_each_chunk`].
     pub fn find(&mut self, sweep: &Sweep, azimuths: Option<&[f32]>) {
         self.grid.update_rows(sweep, self.size.range_m_max, self.size.columns);
         self.cell_of_point.clear();
@@ -46,8 +46,8 @@ impl RadialPoints {
         &self.grid
     }
 
-    /// By point of the sweep: its cell; that of a point beyond the last row is at least the number of cells, and less
-    /// than one row more.
+    /// By point of the sweep: its cell; the cell of a point beyond the last row is at least the number of cells, and
+    /// less than one row more.
     pub fn cells(&self) -> &[u32] {
         &self.cell_of_point
     }

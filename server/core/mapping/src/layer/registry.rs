@@ -1,4 +1,4 @@
-//! The list of the layers, their configuration, and which of them are active.
+//! The list of the layers, their configuration, and which layers are active.
 //!
 //! In: the configuration, the names of the layers with subscribers, scans and map sweeps. Out: the active layers,
 //! in the order of the list. A layer that is not active has no maker: it costs no time and no memory.
@@ -126,7 +126,7 @@ layers! {
     speed: Speed, SpeedConfig;
     /// The layer `safe_path` (UT Austin thesis, section VI).
     safe_path: SafePath, SafePathConfig;
-    /// The layer `freespace`, the one to plan on.
+    /// The layer `freespace`, the layer to plan on.
     freespace: Freespace, FreespaceConfig;
 }
 

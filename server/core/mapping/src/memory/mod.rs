@@ -10,7 +10,7 @@
 //! - In a direction in which the newest map has no return nothing is remembered, for the sensor may be covered there;
 //!   nor is it far beyond the farthest return. A near return proves no more: from the vehicle's middle it may be seen
 //!   in another direction than from the sensor.
-//! - Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
+//! - The cells belong to the world. If a pose is missing or jumps, everything is forgotten.
 
 mod cell;
 pub mod config;
@@ -31,7 +31,7 @@ const CELLS_A_M: f32 = (1.0 / CELL_M) as f32;
 const SIDE: i64 = 256;
 /// Largest height of ground over or under the local ground, metres. Ours; not tuned.
 const GROUND_M_MAX: f32 = 0.2;
-/// Least and greatest height of an obstacle over the local ground, metres: those of the reach stage.
+/// Least and greatest height of an obstacle over the local ground, metres: the heights of the reach stage.
 const OBSTACLE_M: RangeInclusive<f32> = 0.25..=2.5;
 /// Greatest distance and turn between two poses, metres and radians, and how much more a second of time allows. Ours:
 /// no vehicle on wheels is faster.
@@ -99,7 +99,7 @@ impl Memory {
         self.state
     }
 
-    /// Adds the remembered points to those of a map that ends at `stamp_ns`.
+    /// Adds the remembered points to the points of a map that ends at `stamp_ns`.
     pub fn extend(&mut self, sweep: &Sweep, map_from_ego: Option<&Isometry3<f64>>, stamp_ns: i64) {
         if self.newest.is_some_and(|newest| !continues(newest, map_from_ego, stamp_ns)) {
             self.forget();

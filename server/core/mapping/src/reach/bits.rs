@@ -32,7 +32,7 @@ impl Bits {
         self.fill_words(|cells| (0..).zip(cells).fold(0, |word, (bit, cell)| word | u64::from(is_set(cell)) << bit));
     }
 
-    /// Replaces each word by that of `word_of`, which gets the cells of its bits, the lowest first.
+    /// Replaces each word by the word of `word_of`, which gets the cells of its bits, the lowest first.
     pub fn fill_words(&mut self, mut word_of: impl FnMut(Range<usize>) -> u64) {
         for (at, word) in self.words.iter_mut().enumerate() {
             let (first, iy) = (at % self.stride * 64, at / self.stride);
@@ -58,7 +58,7 @@ impl Bits {
         self.words[iy * self.stride + ix / 64] >> (ix % 64) & 1 != 0
     }
 
-    /// Replaces the bits by those of an equally large square.
+    /// Replaces the bits by the bits of an equally large square.
     pub fn copy_from(&mut self, other: &Self) {
         self.words.copy_from_slice(&other.words);
     }

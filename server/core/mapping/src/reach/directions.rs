@@ -1,10 +1,10 @@
 //! Far ground counts as reached only in the directions in which the vehicle gets to it near.
 //!
 //! In: by cell whether it is open, and whether the middle of the vehicle's disc gets there. Out: reached cells without
-//! those that only a detour over farther ground leads to, or a way around what closes their direction near. Rings lie
-//! metres apart far away, so that no return shows a kerb, a ditch or a rail there; but near the vehicle the same edge
-//! was seen. A direction is closed at an edge of near ground if the ground before the edge is open and none of it is
-//! reached. Where an obstacle hides that ground, nothing is known of a kerb, and the direction stays as it was.
+//! the cells that only a detour over farther ground leads to, or a way around what closes their direction near. Rings
+//! lie metres apart far away, so that no return shows a kerb, a ditch or a rail there; but near the vehicle the same
+//! edge was seen. A direction is closed at an edge of near ground if the ground before the edge is open and none of it
+//! is reached. Where an obstacle hides that ground, nothing is known of a kerb, and the direction stays as it was.
 
 use std::f32::consts::TAU;
 
@@ -12,7 +12,7 @@ use super::bits::Bits;
 use super::cells::{SIDE, centre_m};
 use super::flood::Flood;
 
-/// Number of directions. Ours: those of the ground's estimate.
+/// Number of directions. Ours: the directions of the ground's estimate.
 const DIRECTIONS: usize = 180;
 /// The edges of near ground. Ours; tuned on the even seeds of the random worlds.
 const EDGES: [Edge; 2] = [Edge { range_m: 15.0, beside: 2 }, Edge { range_m: 25.0, beside: 1 }];
@@ -26,7 +26,7 @@ const OPEN_SHARE_MIN: f32 = 0.5;
 struct Edge {
     /// Distance from the vehicle, metres.
     range_m: f32,
-    /// Number of directions on each side of a reached one that are open too.
+    /// Number of directions on each side of a reached direction that are open too.
     beside: usize,
 }
 

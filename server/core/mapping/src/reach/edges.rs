@@ -3,8 +3,8 @@
 //! In: the cells beside a step of the ground or in a trough, the obstacles, and the height of the ground in the cells
 //! with a return. Out: the cells on the continuation of each straight edge near the vehicle: a kerb, a bank, a ditch.
 //! Such an edge is seen near the vehicle; farther away rings lie so far apart that no return shows a step, but the edge
-//! still goes on. The continuation ends where a ring crosses it over even ground; that of the side of an obstacle, such
-//! as a parked car, also where it lies across the view and the ground before and behind it is even.
+//! still goes on. The continuation ends where a ring crosses it over even ground; the continuation of the side of an
+//! obstacle, such as a parked car, also where it lies across the view and the ground before and behind it is even.
 
 use std::f32::consts::PI;
 
@@ -249,7 +249,7 @@ fn across_m([sin, cos]: [f32; 2], [x, y]: [f32; 2]) -> f32 {
     cos * y - sin * x
 }
 
-/// The line at a distance from the one through the origin.
+/// The line at a distance from the line through the origin.
 fn line(across_m: f32) -> usize {
     ((across_m + RANGE_M_MAX) / LINE_M) as usize
 }

@@ -60,7 +60,7 @@ impl Run {
 #[derive(Clone, Debug)]
 pub struct PolarRuns {
     runs: Vec<Run>,
-    /// Index of the first run of each word, and of the one after the last.
+    /// Index of the first run of each word, and of the word after the last.
     first_of_word: Vec<u32>,
 }
 

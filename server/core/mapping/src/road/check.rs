@@ -43,7 +43,7 @@ pub enum RoadError {
         /// The point's y coordinate, metres.
         y_m: f64,
     },
-    /// A point is too near to the one before it.
+    /// A point is too near to the point before it.
     #[error("road point {index} is {distance_m} m from the one before: 0.01 m or more is allowed")]
     Coinciding {
         /// Index of the point, counted from 0.
@@ -69,7 +69,7 @@ pub enum RoadError {
         /// Sum of the votes.
         votes: f64,
     },
-    /// The number of speed limits is neither 0 nor that of the points.
+    /// The number of speed limits is neither 0 nor the number of points.
     #[error("road with {points} points and {limits} speed limits: none or one a point are allowed")]
     SpeedLimits {
         /// Number of points.

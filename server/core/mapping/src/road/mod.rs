@@ -27,8 +27,7 @@ pub use store::{Roads, StoredRoad};
 /// A road: points along its middle, and its width at each. [`check`](check()) states what is allowed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Road {
-    /// Time at which the road was seen or read, ns since the Unix epoch. The ego frame of the points is the one of this
-    /// stamp.
+    /// Time at which the road was seen or read, ns since the Unix epoch. The points are in the ego frame of this stamp.
     pub stamp_ns: i64,
     /// What the road is used for.
     pub purpose: RoadPurpose,
@@ -47,7 +46,7 @@ pub struct Road {
 /// What a road is used for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RoadPurpose {
-    /// A detected road or a lane: it is painted into the speed map, and replaces the one before.
+    /// A detected road or a lane: it is painted into the speed map, and replaces the road before.
     Paint,
     /// The centre line of the route (RDDF): it is never painted. Its curvature shows where a detector fails; its width
     /// is the corridor in which roads are painted; its limits cap the speed.

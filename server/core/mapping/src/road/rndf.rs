@@ -81,8 +81,8 @@ impl Rndf {
 }
 
 impl Lane {
-    /// The lane as a road to paint, in a local frame. Its width is that of the file, or else `width_m_default`; `None`
-    /// if neither is known.
+    /// The lane as a road to paint, in a local frame. Its width is the file's, or else `width_m_default`; `None` if
+    /// neither is known.
     pub fn road(&self, frame: &LocalFrame, width_m_default: Option<f64>, stamp_ns: i64) -> Option<Road> {
         let width_m = self.width_m.or(width_m_default)?;
         Some(Road {

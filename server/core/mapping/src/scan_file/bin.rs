@@ -21,7 +21,7 @@ const ODD_PARTS_MAX: usize = 20;
 ///
 /// # Errors
 /// [`ScanFileError::Length`] if the file is not a list of 1 to [`POINTS_MAX`] points, [`ScanFileError::Content`] if its
-/// values are those of neither format.
+/// values fit neither format.
 pub fn read_bin(bytes: &[u8]) -> Result<Scan, ScanFileError> {
     read_named("", bytes).map(|(_, scan)| scan)
 }
@@ -89,7 +89,7 @@ fn points<const STRIDE: usize>(bytes: &[u8]) -> Scan {
     let mut scan = Scan { x: field(0), y: field(1), z: field(2), intensity: field(3), ..Scan::default() };
     if STRIDE == 20 {
         scan.intensity.iter_mut().for_each(|intensity| *intensity /= INTENSITY_MAX);
-        // A ring that is no whole number is saturated; so few points have one that the ring's elevation stays.
+        // A ring that is no whole number is saturated; so few points have such a ring that the ring's elevation stays.
         scan.ring = field(4).into_iter().map(|ring| ring as u16).collect();
     }
     scan

@@ -5,7 +5,7 @@
 //! |---|---|
 //! | `bin` | float32 x y z intensity (KITTI), or with ring (nuScenes); the content decides which -> scan |
 //! | `pcd` | `.pcd` in ASCII, binary and compressed binary -> scan |
-//! | `lzf` | LZF -> plain bytes, of which there are as many as stated |
+//! | `lzf` | LZF -> plain bytes, as many as stated |
 //! | `format` | the formats; rings for a scan whose file states none |
 //! | `error` | why a file is refused |
 //!

@@ -9,7 +9,7 @@ use clearway_lidar::model::Model;
 use crate::value_check::{ConfigValueError, check, check_name};
 
 /// Greatest length of a calibration that a declared sensor brings, bytes. Ours: half as much again as the longest table
-/// of any model, that of a VLS-128.
+/// of any model, the table of a VLS-128.
 const CALIBRATION_BYTES_MAX: usize = 64 << 10;
 /// Greatest number of blind sectors of one sensor. Ours.
 pub const BLIND_MAX: usize = 16;
@@ -49,10 +49,10 @@ pub struct SensorConfig {
     /// receiver's date is wrong.
     #[serde(default = "default_gps_late_days_max")]
     pub gps_late_days_max: f64,
-    /// Elevation of each laser, degrees; for a sensor that sends scans. They come before those of the model. Without
-    /// either, the elevations are measured from the rings of the first scan; if that has no rings, from the order and
-    /// the elevations of its points; if these show no lasers, the rows of radial maps that this sensor defines have the
-    /// same depth.
+    /// Elevation of each laser, degrees; for a sensor that sends scans. They come before the elevations of the model.
+    /// Without either, the elevations are measured from the rings of the first scan; if that has no rings, from the
+    /// order and the elevations of its points; if these show no lasers, the rows of radial maps that this sensor
+    /// defines have the same depth.
     #[serde(default)]
     pub elevations_deg: Vec<f32>,
     /// Standard deviation of the sensor's range noise, metres; the roughness of the ground is measured without it.

@@ -2,8 +2,8 @@
 //!
 //! In: one echo of a [`Revolution`]. Out: by slot, smoothed range minus measured range, metres. The series of a laser
 //! holds its ranges of the revolution in time order. A missing return is replaced by the last valid one, as in the
-//! paper. The smoothed range is the mean of nine ranges; at the two ends of the revolution it is the mean of those that
-//! exist. Firings in which a laser does not fire (HDL-64E S1) are not part of its series.
+//! paper. The smoothed range is the mean of nine ranges; at the two ends of the revolution it is the mean of the ranges
+//! that exist. Firings in which a laser does not fire (HDL-64E S1) are not part of its series.
 
 use clearway_lidar::revolution::Revolution;
 
@@ -98,7 +98,7 @@ mod tests {
         assert!((found[10] - 0.8).abs() < 1e-5, "{found:?}");
         assert!((found[6] - -0.1).abs() < 1e-5 && found[5].abs() < 1e-5, "{found:?}");
         assert!(found[14].is_nan() && found[15].abs() < 1e-5, "{found:?}");
-        // At the end the mean is that of five ranges: 9.5 and four times 10.
+        // At the end it is the mean of five ranges: 9.5 and four times 10.
         ranges[19] = 9.5;
         assert!((deviations(&ranges, 1)[19] - 0.4).abs() < 1e-5);
     }

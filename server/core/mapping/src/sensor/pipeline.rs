@@ -35,7 +35,7 @@ use crate::sensor::sweep::Mount;
 /// ones do not either, and each estimate takes as long as a layer.
 const ESTIMATES_MAX: u64 = 20;
 
-/// Standard deviation of the range noise of a sensor whose model is not known, metres. Ours: that of an HDL-64E or
+/// Standard deviation of the range noise of a sensor whose model is not known, metres. Ours: the noise of an HDL-64E or
 /// HDL-32E, the least of the family, so that no roughness is lost.
 const RANGE_NOISE_M: f32 = 0.02;
 
@@ -65,7 +65,7 @@ pub(crate) struct SensorPipeline {
     scans: u64,
     /// Number of returns in all accepted scan events.
     scan_returns: u64,
-    /// Configured standard deviation of the range noise, metres; `None` selects that of the model.
+    /// Configured standard deviation of the range noise, metres; `None` selects the noise of the model.
     range_noise_m: Option<f32>,
     /// Configured model.
     model: Option<Model>,

@@ -4,7 +4,7 @@
 //! In: a [`Scan`] that states the ring of each point. Out: by point, smoothed range minus measured range, metres. The
 //! series of a ring holds the ranges of its points by azimuth, whatever the order of the points. Gaps in azimuth are
 //! missing returns; the last valid range replaces them, as in the paper. The smoothed range is the mean of nine ranges;
-//! at the two ends of the ring it is the mean of those that exist. A point at the azimuth of the point before is a
+//! at the two ends of the ring it is the mean of the ranges that exist. A point at the azimuth of the point before is a
 //! second echo of the same ray; it is not part of the series.
 
 use crate::sensor::distance_series::REACH;

@@ -33,7 +33,7 @@ pub(crate) struct SensorScan {
     pub tilt_rad: f32,
     /// Points, ego frame at `end_ns`.
     pub sweep: Arc<Sweep>,
-    /// Memory for the points of the next scan, while a map holds those of this one.
+    /// Memory for the points of the next scan, while a map holds the points of this scan.
     spare: Arc<Sweep>,
     /// Directions (unit vectors) of the rays without a return, ego frame at `end_ns`; empty unless a layer needs them.
     pub no_returns: Vec<[f32; 3]>,
@@ -69,7 +69,7 @@ impl SensorScan {
         self.completed > 0 && self.state.contribution == Contribution::Empty
     }
 
-    /// True if no sensor has this index at present: the one that had it was withdrawn.
+    /// True if no sensor has this index at present: the sensor that had it was withdrawn.
     pub fn is_withdrawn(&self) -> bool {
         self.state.name.is_empty()
     }

@@ -17,7 +17,7 @@ pub struct SensorState {
     pub model: &'static str,
     /// Number of data packets of the revolution; 0 for scans.
     pub packets: u32,
-    /// Number of data packets of the revolution and of those that are missing before them, ±1 a gap; 0 for scans.
+    /// Number of data packets of the revolution and of the missing packets before them, ±1 a gap; 0 for scans.
     pub packets_expected: u32,
     /// Number of datagrams and scans that were refused since the start, without copies of packets.
     pub refused: u64,
@@ -226,7 +226,7 @@ impl ElevationSource {
         }
     }
 
-    /// What follows from the source, and what to do; `None` if the elevations are those of the sensor.
+    /// What follows from the source, and what to do; `None` if the sensor has these elevations itself.
     pub fn advice(self) -> Option<&'static str> {
         match self {
             Self::Table | Self::StatusBytes | Self::Model | Self::Configured | Self::Rings => None,

@@ -57,7 +57,7 @@ pub struct Sweep {
     /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all
     /// rows have the same depth.
     pub calibration: Option<Arc<Calibration>>,
-    /// Number of points at the end that no sensor has measured in this sweep: those of its memory.
+    /// Number of points at the end that no sensor has measured in this sweep: its remembered points.
     pub remembered: usize,
     /// Height of the sensor over the ground, metres.
     pub mount_height_m: f32,
@@ -66,12 +66,12 @@ pub struct Sweep {
 }
 
 impl Sweep {
-    /// Replaces the points by those of a revolution of a vehicle at rest, without a self filter.
+    /// Replaces the points by the points of a revolution of a vehicle at rest, without a self filter.
     pub fn set_revolution(&mut self, revolution: &Revolution, mount: &Mount) {
         self.set_moving_revolution(revolution, mount, &[], None);
     }
 
-    /// Replaces the points by those of a revolution and returns the number of points that the filter removed.
+    /// Replaces the points by the points of a revolution and returns the number of points that the filter removed.
     /// `end_from_ego` is [`crate::sensor::motion::EgoTrajectory::end_from_ego`] of this revolution; if it is empty, the
     /// points are not moved.
     pub fn set_moving_revolution(
@@ -139,14 +139,14 @@ impl Sweep {
         }
     }
 
-    /// Replaces the points by those of a scan of a vehicle at rest, without a self filter. Returns the number of points
-    /// that were removed because a coordinate is not finite or beyond 1 km. The four arrays of the scan must have the
-    /// same length.
+    /// Replaces the points by the points of a scan of a vehicle at rest, without a self filter. Returns the number of
+    /// points that were removed because a coordinate is not finite or beyond 1 km. The four arrays of the scan must
+    /// have the same length.
     pub fn set_scan(&mut self, scan: &Scan, calibration: &Arc<Calibration>, mount: &Mount) -> u64 {
         self.set_moving_scan(scan, Some(calibration), mount, &[], None).no_position
     }
 
-    /// Replaces the points by those of a scan and returns the number of points that were removed. `calibration` is
+    /// Replaces the points by the points of a scan and returns the number of points that were removed. `calibration` is
     /// `None` if the elevations are unknown; `end_from_ego` is [`crate::sensor::motion::EgoTrajectory::end_from_ego`]
     /// of this scan; if it is empty, the points are not moved.
     pub fn set_moving_scan(
@@ -181,7 +181,7 @@ impl Sweep {
         removed
     }
 
-    /// Replaces all values by those of another sweep; the memory is reused.
+    /// Replaces all values by the values of another sweep; the memory is reused.
     pub(crate) fn copy_from(&mut self, other: &Sweep) {
         for (axis, from) in [(&mut self.x, &other.x), (&mut self.y, &other.y), (&mut self.z, &other.z)] {
             axis.clone_from(from);
@@ -193,7 +193,7 @@ impl Sweep {
     }
 
     /// Adds another sensor's points after transforming them, with their deviations. If this sweep has no rows of radial
-    /// maps, those of the other sweep are used.
+    /// maps, the rows of the other sweep are used.
     pub(crate) fn append(&mut self, other: &Sweep, self_from_other: &Isometry3<f64>) {
         let transform = Transform::new(self_from_other);
         // A sensor without deviations has an empty list.

@@ -76,7 +76,7 @@ impl MovedPoints {
     }
 }
 
-/// Moves the slots of a revolution by one transform, finds which of them a sweep keeps, and counts the returns. A slot
+/// Moves the slots of a revolution by one transform, finds the slots that a sweep keeps, and counts the returns. A slot
 /// that has not fired is NaN, one without a return is 0: neither is kept.
 pub(crate) struct MoveReturns<'a> {
     pub(crate) range_m: &'a [f32],
@@ -104,7 +104,7 @@ impl WideLoop for MoveReturns<'_> {
     }
 }
 
-/// Moves the points of a scan by one transform, finds which of them a sweep keeps, and counts the positions and the
+/// Moves the points of a scan by one transform, finds the points that a sweep keeps, and counts the positions and the
 /// returns.
 pub(crate) struct MoveAtRest<'a> {
     pub(crate) points: [&'a [f32]; 3],

@@ -64,7 +64,7 @@ pub fn cell_corners(layer: &Layer, cell: usize, map_from_ego: &Isometry3<f64>) -
 }
 
 impl Street {
-    /// Layer `number`, which ends 100 ms after the one before, with the pose of the vehicle and the time (s) at its
+    /// Layer `number`, which ends 100 ms after the layer before, with the pose of the vehicle and the time (s) at its
     /// end.
     pub fn map(&mut self, number: i64) -> (Layer, Isometry3<f64>, f64) {
         let speed_mps = Some(self.scene.drive.speed);

@@ -83,7 +83,7 @@ fn a_sensor_that_always_comes_too_late_is_not_waited_for() {
 #[test]
 fn scans_that_arrive_at_once_make_a_map_each() {
     let mut events: Vec<Event> = (1..5).flat_map(|n| [late(0, n * 100, 0), late(1, n * 100, 5)]).collect();
-    // After a pause of the host two scans of the reference sensor arrive at once, before those of the left sensor.
+    // After a pause of the host two scans of the reference sensor arrive at once, before the scans of the left sensor.
     events.extend([late(0, 500, 105), late(0, 600, 5), late(1, 500, 106), late(1, 600, 6)]);
     events.extend([late(0, 700, 0), late(1, 700, 5), late(0, 800, 0), late(1, 800, 5)]);
     let made = maps(&events);

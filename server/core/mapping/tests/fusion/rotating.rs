@@ -105,7 +105,7 @@ fn two_rotating_sensors_have_a_decoder_and_a_ledger_each() {
     assert_eq!(sum.received, events.len() as u64);
     assert_eq!(run(&events).0, made, "the same events give the same maps");
 
-    // Without events of other sensors the maps are those of a vehicle with one sensor.
+    // Without events of other sensors the maps are the maps of a vehicle with one sensor.
     let only: Vec<_> = run(&reference).0;
     let mut single =
         Pipeline::new(&VehicleConfig { sensors: vec![config.sensors[0].clone()], ..config.clone() }, vec![None])

@@ -102,7 +102,7 @@ fn rows_come_from_the_configured_elevations_or_from_the_rings_of_the_scan() {
         assert!(rows.windows(2).all(|pair| (pair[1] - pair[0] - 1.0).abs() < 1e-3), "rows of 1 m: {rows:?}");
         assert!(common::classes(layer).iter().any(|class| *class != 0), "{}", layer.name);
     }
-    // If the reference sensor has no rings, the rows are those of a sensor that has them.
+    // If the reference sensor has no rings, a sensor that has rings gives the rows.
     let mut two = config();
     two.sensors[0].model = None;
     let mut pipeline = pipeline(&two);

@@ -177,7 +177,7 @@ fn at_15_mps_walls_are_straight_with_poses_and_bent_without() {
     assert!(*speed_rms < 0.7 * off_rms, "{speed_rms} {off_rms}");
     assert!(*off_rms > 0.3 && *off_max > 1.0, "{off_rms} {off_max}");
 
-    // The pose of the map is the one at the capture's end, whether points are moved or not.
+    // The pose of the map is the pose at the capture's end, whether points are moved or not.
     for map in [often, off] {
         let (given, truth) = (map.map_from_ego.unwrap(), vehicle.pose_at(map.capture_end_ns));
         assert!((given.translation.vector - truth.translation.vector).norm() < 0.01);
@@ -202,7 +202,7 @@ fn the_same_events_move_each_point_equally() {
     let events = drive(Some(20_000_000), false);
     let (map, sweep) = second(MotionConfig::default(), &events);
     assert_eq!(second(MotionConfig::default(), &events), (map.clone(), sweep.clone()));
-    // Without the events after the one that completed the map.
+    // Without the events after the event that completed the map.
     let last = events.iter().position(|event| event.arrival_ns > map.completed_ns).unwrap();
     assert_eq!(second(MotionConfig::default(), &events[..last]), (map, sweep));
 }
@@ -461,7 +461,7 @@ fn recorded_scans_of_kitti_match_in_the_world_frame() {
         let rotation = nalgebra::Matrix3::new(p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]);
         let first_from_this =
             Isometry3::from_parts(Translation3::new(p[3], p[7], p[11]), UnitQuaternion::from_matrix(&rotation));
-        // The derived poses are those of the sensor; the world frame is the first ego frame.
+        // The derived poses are the sensor's; the world frame is the first ego frame.
         let map_from_ego = ego_from_sensor * first_from_this * ego_from_sensor.inverse();
         let event = |body| Event { sequence: 0, arrival_ns: stamp_ns, source: 0, body };
         pipeline.step(&event(Body::EgoPose(pose(stamp_ns, map_from_ego)))).unwrap();

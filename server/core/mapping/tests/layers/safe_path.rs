@@ -110,7 +110,7 @@ fn a_corridor_has_its_middle_line_with_half_its_width_as_radius() {
         assert_eq!(line.len(), side, "{free} cells");
         for point in line {
             assert_eq!(point.clearance_squared, (free * free) as i32);
-            // The middle of 7 cells is the centre of a cell; that of 8 lies between two.
+            // The middle of 7 cells is the centre of a cell; the middle of 8 lies between two cells.
             assert_eq!(point.position[1], 2 * 26 + free as i32 - 1);
         }
     }

@@ -119,8 +119,8 @@ fn wrong(score: &Score, class: Truth) -> usize {
 /// Least precision and recall of a scene. The targets are 99.9 % and 98 %.
 ///
 /// The precision on slopes is 99.9 % with columns of one degree, and less with wider ones: most points of a cell on the
-/// rim of a ditch or of a step lie on its face, but the highest point, the only one that the thesis keeps, lies on the
-/// level ground.
+/// rim of a ditch or of a step lie on its face, but the highest point, the only point that the thesis keeps, lies on
+/// the level ground.
 fn required(scene: &str) -> (f64, f64) {
     match scene {
         "slopes with obstacles" => (0.996, 0.985),

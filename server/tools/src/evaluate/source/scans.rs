@@ -22,7 +22,7 @@ use super::labels;
 use super::objects::judge_objects;
 use super::one_sensor::{pipeline, step};
 use super::pairs::LabelledScan;
-use super::variation::Variation;
+use super::variation::{Variation, Varied};
 use super::written::{WrittenFrame, write};
 
 /// How the sensor is mounted on KITTI's car, from KITTI's published sensor setup. The published metrics of other
@@ -64,20 +64,13 @@ pub fn judge_folder(
         if options.objects {
             judge_objects(&scan, &truths, (maps, model, extrinsics), source)?;
         }
+        let frame = LabelledFrame { index, pair, classes: &classes, truths: &truths };
         for (variation, made) in options.variations.iter().zip(&mut pipelines) {
-            let row_name = variation.to_string();
             let varied = variation.apply(&scan, extrinsics).with_context(|| pair.scan.display().to_string())?;
             if let Some(folder) = &options.write_scans {
-                let name = pair.scan.file_stem().unwrap_or_default().to_string_lossy();
-                let truth = varied.original.iter().map(|index| {
-                    let index = *index as usize;
-                    (classes[index], truths[index].map_or([Scored::Not; 2], |point| point.ground))
-                });
-                let folder = folder.join(&row_name);
-                let frame = WrittenFrame { folder: &folder, name: &name, path: &source.path, rows: &[&row_name] };
-                write(&frame, (&varied.scan, &varied.extrinsics), truth)?;
+                frame.write(&varied, &variation.to_string(), folder, &source.path)?;
             }
-            let (pipeline, mount) = match made {
+            let made = match made {
                 Some(made) => made,
                 None => {
                     // Chosen lasers are a sensor of their own, whose elevations follow from its rings.
@@ -85,34 +78,65 @@ pub fn judge_folder(
                     made.insert(pipeline(maps, model, varied.extrinsics)?)
                 }
             };
-            let place = |i: usize| [varied.scan.x[i], varied.scan.y[i], varied.scan.z[i]];
-            let kept = (0..varied.original.len()).filter(|i| Sweep::keeps(mount, place(*i)));
-            let kept: Vec<usize> = kept.map(|i| varied.original[i] as usize).collect();
-            let begun = Instant::now();
-            step(pipeline, varied.scan, index, &pair.scan)?;
-            let step_ms = begun.elapsed().as_secs_f64() * 1e3;
-            let sweep = pipeline.newest_sweep();
-            let points: Vec<JudgedPoint> = kept
-                .iter()
-                .zip(0..)
-                .map(|(original, i)| {
-                    let place = [sweep.x[i], sweep.y[i], sweep.z[i]];
-                    JudgedPoint { place, ..truths[*original].unwrap_or(UNKNOWN) }
-                })
-                .collect();
-            let row = source.row(&row_name, variation.is_final_only());
-            // Fewer lasers are judged by the truth of all of them, which lie in the same frame.
-            let all: Vec<JudgedPoint> = match variation {
-                Variation::Lasers(_) => truths.iter().flatten().copied().collect(),
-                _ => Vec::new(),
-            };
-            let whole = if all.is_empty() { &points } else { &all };
-            row.judge_map(pipeline, FrameTruth { points: &points, whole, known: &[] })?;
-            row.step_ms.push(step_ms);
+            frame.judge(varied, *variation, made, source)?;
             judged();
         }
     }
     Ok(())
+}
+
+/// A scan as it was recorded, with its labels.
+struct LabelledFrame<'a> {
+    index: u64,
+    pair: &'a LabelledScan,
+    classes: &'a [u32],
+    /// The truth of each point; `None` for points too near to be kept.
+    truths: &'a [Option<JudgedPoint>],
+}
+
+impl LabelledFrame<'_> {
+    /// Writes a variation of the scan, and its truth, to a folder of its name.
+    fn write(&self, varied: &Varied, row_name: &str, folder: &Path, path: &str) -> Result<()> {
+        let name = self.pair.scan.file_stem().unwrap_or_default().to_string_lossy();
+        let truth = varied.original.iter().map(|index| {
+            let index = *index as usize;
+            (self.classes[index], self.truths[index].map_or([Scored::Not; 2], |point| point.ground))
+        });
+        let frame = WrittenFrame { folder: &folder.join(row_name), name: &name, path, rows: &[row_name] };
+        write(&frame, (&varied.scan, &varied.extrinsics), truth)
+    }
+
+    /// Judges the map of a variation of the scan.
+    fn judge(
+        &self,
+        varied: Varied,
+        variation: Variation,
+        (pipeline, mount): &mut (Pipeline, Mount),
+        source: &mut EvaluatedSource,
+    ) -> Result<()> {
+        let place = |i: usize| [varied.scan.x[i], varied.scan.y[i], varied.scan.z[i]];
+        let kept = (0..varied.original.len()).filter(|i| Sweep::keeps(mount, place(*i)));
+        let kept: Vec<usize> = kept.map(|i| varied.original[i] as usize).collect();
+        let begun = Instant::now();
+        step(pipeline, varied.scan, self.index, &self.pair.scan)?;
+        let step_ms = begun.elapsed().as_secs_f64() * 1e3;
+        let sweep = pipeline.newest_sweep();
+        let point = |(original, i): (&usize, usize)| {
+            let place = [sweep.x[i], sweep.y[i], sweep.z[i]];
+            JudgedPoint { place, ..self.truths[*original].unwrap_or(UNKNOWN) }
+        };
+        let points: Vec<JudgedPoint> = kept.iter().zip(0..).map(point).collect();
+        // Fewer lasers are judged by the truth of all of them, which lie in the same frame.
+        let all: Vec<JudgedPoint> = match variation {
+            Variation::Lasers(_) => self.truths.iter().flatten().copied().collect(),
+            _ => Vec::new(),
+        };
+        let whole = if all.is_empty() { &points } else { &all };
+        let row = source.row(&variation.to_string(), variation.is_final_only());
+        row.judge_map(pipeline, FrameTruth { points: &points, whole, known: &[] })?;
+        row.step_ms.push(step_ms);
+        Ok(())
+    }
 }
 
 /// The truth about a point that the recorded scan's truth does not cover.

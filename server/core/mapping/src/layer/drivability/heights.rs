@@ -107,7 +107,7 @@ impl Heights {
     }
 }
 
-/// Keeps the higher point (UT Austin thesis, function `adjustHeight`), of equally high points the one with the larger
+/// Keeps the higher point (UT Austin thesis, function `adjustHeight`), of equally high points the point with the larger
 /// x, then y, so that the order of the points does not matter.
 #[inline(always)]
 fn adjust_height(cell: &mut Highest, height: f32, point: usize, sweep: &Sweep) {

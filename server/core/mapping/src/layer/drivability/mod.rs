@@ -11,7 +11,7 @@
 //! | which segments are drivable from one another, breadth first from segment 0 | section IV.5 | [`search`] |
 //!
 //! The result does not depend on the order of the points: a cell keeps its highest point, and of equally high points
-//! the one with the largest x, then y; all later steps visit the cells in the order of the grid.
+//! the point with the largest x, then y; all later steps visit the cells in the order of the grid.
 
 pub mod class;
 pub mod config;

@@ -89,7 +89,7 @@ impl Moments {
             )
         } else if trace > 0.0 {
             // Cells in a line, a thousand times longer than wide, determine the slope along the line only: of all
-            // solutions this is the one of least slope.
+            // solutions this has the least slope.
             let scale = 1.0 / (trace * trace);
             ((self.xx * self.xz + self.xy * self.yz) * scale, (self.xy * self.xz + self.yy * self.yz) * scale)
         } else {

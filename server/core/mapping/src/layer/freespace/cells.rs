@@ -30,7 +30,7 @@ pub struct Findings<'a> {
 }
 
 impl Findings<'_> {
-    /// Writes the class of each cell but those of the vehicle.
+    /// Writes the class of each cell but the cells of the vehicle.
     pub fn write_classes(&self, class: &mut Vec<u8>) {
         let bits = self.reach.bits();
         let [occupied, not_reached, hidden] = self.blocked;

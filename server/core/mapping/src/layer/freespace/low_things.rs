@@ -34,7 +34,7 @@ const EVEN_MM: i16 = 30;
 const ROUGH_MM: i16 = 50;
 /// Scores of rough ground, millimetres. Ours: noise scores less, things more.
 const ROUGH_SCORE_MM: std::ops::Range<i16> = 50..110;
-/// Half the side of the box of which a share of 10 to 30 % is rough, in cells.
+/// Half the side, in cells, of the box in which a share of 10 to 30 % is rough.
 const ROUGH_HALF: usize = 8;
 /// Bits of the number of cells of a box: the largest has 17 x 17. A sum of heights, at most 32.767 m in 9 x 9 cells,
 /// fits into the others.
@@ -243,7 +243,7 @@ impl BoxSums {
         Self { along: zeros.clone(), sums: zeros, before: Vec::new(), column_sums: vec![0; WINDOW] }
     }
 
-    /// Replaces the sums by those of boxes of `2 * half + 1` cells a side.
+    /// Replaces the sums by the sums of boxes of `2 * half + 1` cells a side.
     #[inline(always)]
     fn add_up(&mut self, values: &[i32], half: usize) {
         let (before, width) = (&mut self.before, 2 * half + 1);

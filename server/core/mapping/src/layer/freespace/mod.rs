@@ -1,4 +1,4 @@
-//! The layer `freespace`, the one to plan on: where the whole vehicle can drive. Not in the papers.
+//! The layer `freespace`, the layer to plan on: where the whole vehicle can drive. Not in the papers.
 //!
 //! In: the local ground, and what the vehicle can reach on it ([`Reach`]), by cell of 0.25 m to 64 m, ego frame. Out:
 //! the layer on the same cells. The papers' layers judge a cell only if a return fell into it; here a cell is free if
@@ -68,7 +68,7 @@ pub struct Freespace {
     low: Bits,
     drop: Bits,
     free: Bits,
-    /// The cells that only a step closes; those of them that are free.
+    /// The cells that only a step closes; in `released`, the free cells among them.
     stepped: Bits,
     released: Bits,
     /// The outline whose cells are known, the cells with their centres in it, the other cells that it touches, and the

@@ -16,7 +16,7 @@ const APART_MM_MAX: i32 = 80;
 const HALF: usize = 2;
 
 /// Calls `release` with each cell that a step alone closes (`stepped`) and that is free like the cells around it.
-/// `covered` are the cells that the vehicle's disc covers, `free` those of them that are free.
+/// `covered` are the cells that the vehicle's disc covers, `free` the free cells among them.
 pub fn find(reach: &Reach, stepped: &Bits, covered: &Bits, free: &Bits, mut release: impl FnMut(usize, usize)) {
     let spans = reach.ground_spans_mm();
     stepped.each(|ix, iy| {

@@ -7,7 +7,7 @@
 //! fast, nearly every border moves from map to map, and nothing is replaced.
 //!
 //! What a cell is follows from the states of the last maps alone, so that the maps of a pipeline that begins later soon
-//! equal those of an earlier one.
+//! equal the maps of an earlier pipeline.
 
 use super::class::OccupancyClass;
 
@@ -25,7 +25,8 @@ const WAS_CLEAR: u8 = 0b1000;
 /// Place of the bits with the last state that was not clear.
 const LAST: u32 = 4;
 
-/// The cells around the vehicle that flicker, stored like those of the window: world cell (i, j) at (i mod n, j mod n).
+/// The cells around the vehicle that flicker, stored like the cells of the window: world cell (i, j) at (i mod n, j mod
+/// n).
 #[derive(Clone)]
 pub struct Flicker {
     /// Number of maps in which a cell that was clear and no longer is does not become clear again.

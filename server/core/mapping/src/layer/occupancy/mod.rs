@@ -25,9 +25,9 @@
 //!
 //! Hits add up over maps. A single Velodyne at 10 Hz on a standing vehicle reports near cars as occupied at once, and
 //! far ones after some scans. Until then their cells are unknown, or occluded if something hides them as well. Heights
-//! are those over the local ground ([`crate::ground`]).
+//! are heights over the local ground ([`crate::ground`]).
 //!
-//! Without an ego pose the cells of the last map cannot be related to those of this one. The grid then has the
+//! Without an ego pose the cells of the last map cannot be related to the cells of this map. The grid then has the
 //! vehicle's axes and contains only evidence since the last map (the metric `world_aligned` is 0).
 
 mod azimuth_bins;

@@ -205,7 +205,7 @@ impl Window {
         });
         class.iter_mut().for_each(|class| *class = states[usize::from(*class & 15)]);
         if !self.anchored {
-            // Without a pose these cells cannot be related to those of the next map.
+            // Without a pose these cells cannot be related to the cells of the next map.
             self.clear();
         }
     }

@@ -1,8 +1,8 @@
 //! Distance transform: exact Euclidean distances to the nearest cell that is not free, in whole numbers.
 //!
 //! In: a [`State`] for each cell. Out: for each cell the nearest cell that is not free (its site); for any position in
-//! half cells the exact distance to the square of the nearest such cell. The algorithm is that of Meijster, Roerdink
-//! and Hesselink 2000: first along columns, then along rows as a lower envelope of parabolas; linear in the number of
+//! half cells the exact distance to the square of the nearest such cell. The algorithm is from Meijster, Roerdink and
+//! Hesselink 2000: first along columns, then along rows as a lower envelope of parabolas; linear in the number of
 //! cells.
 
 use super::free_space::State;

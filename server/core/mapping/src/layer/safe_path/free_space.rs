@@ -153,7 +153,7 @@ impl FreeSpace {
         }
     }
 
-    /// Closes the cells in which an obstacle stands, and those that the vehicle cannot reach.
+    /// Closes the cells in which an obstacle stands, and the cells that the vehicle cannot reach.
     fn add_obstacles(&mut self, context: &Context<'_>) {
         let Some(reach) = context.reach else { return };
         for (state, &cell) in self.states.iter_mut().zip(&self.reach_cell) {
@@ -197,7 +197,7 @@ impl FreeSpace {
     /// Makes radial cells unknown that have returns only from the vehicle itself.
     fn remove_own_returns(&mut self, sweep: &Sweep, outline: &Outline) {
         let corner_m = libm::hypotf(outline.front_m.max(outline.rear_m), outline.width_m / 2.0);
-        // Rows up to the end of the last one that touches the outline.
+        // Rows up to the end of the last row that touches the outline.
         let rows = (0..self.grid.rows()).take_while(|row| self.grid.row_span_m(*row).0 < corner_m).count();
         let reach_m = rows.checked_sub(1).map_or(0.0, |last| self.grid.row_span_m(last).1);
         self.returns.clear();

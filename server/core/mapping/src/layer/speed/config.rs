@@ -65,7 +65,7 @@ pub struct SpeedConfig {
     /// not tuned.
     #[serde(skip)]
     pub rough_share: f32,
-    /// Speed of cells of which nothing is known, m/s; less than `crawl_mps`, so that the two differ. 1 is ours; not
+    /// Speed of cells about which nothing is known, m/s; less than `crawl_mps`, so that the two differ. 1 is ours; not
     /// tuned.
     #[serde(skip)]
     pub unknown_mps: f32,

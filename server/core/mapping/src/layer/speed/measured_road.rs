@@ -210,7 +210,7 @@ fn edge_m(side: &[Bin; BINS]) -> Option<f32> {
             continue;
         };
         unknown = 0;
-        // The ground just inside: the bins before, except the one that a step is spread over.
+        // The ground just inside: the bins before, except the bin that a step is spread over.
         let inside: Vec<f32> =
             side[index.saturating_sub(2 + GAP_BINS)..index.saturating_sub(1)].iter().filter_map(height).collect();
         if inside.is_empty() {

@@ -96,7 +96,7 @@ impl Speed {
         crawl_mps + (off_road_mps - crawl_mps) * evenness * factor
     }
 
-    /// A speed with the limits of the route; `limit_mps` is that of the cell in the corridor.
+    /// A speed with the limits of the route; `limit_mps` is the limit of the cell in the corridor.
     fn limited_mps(&self, mps: f32, limit_mps: f32) -> f32 {
         match limit_mps {
             OUTSIDE => mps,
@@ -105,7 +105,7 @@ impl Speed {
         }
     }
 
-    /// Raw value of the speed of a passable cell: neither 0, which is an obstacle, nor that of an unknown cell.
+    /// Raw value of the speed of a passable cell: neither 0, which is an obstacle, nor the value of an unknown cell.
     fn raw(&self, mps: f32) -> u8 {
         match (mps / SPEED_SCALE_MPS) as u8 {
             0 if self.unknown() == 1 => 2,

@@ -13,7 +13,8 @@ use crate::road::RoadFrame;
 use super::config::{CURVATURE_PER_M_MAX, DIVERGENCE_MIN, ROAD_AGE_MS_MAX, ROUTE_AHEAD_M};
 
 /// Half the length over which the route's curvature is measured, metres. Ours: RDDF rows are metres to hundreds of
-/// metres apart, so the curvature at a corner is that of the circle through the points this far before and behind it.
+/// metres apart, so the curvature at a corner is the curvature of the circle through the points this far before and
+/// behind it.
 const BASE_M: f64 = 5.0;
 /// Distance between samples of the route ahead, metres. Ours; not tuned.
 const STEP_M: f64 = 1.0;
@@ -84,7 +85,7 @@ impl PaintingConditions {
         self.check_route(context);
     }
 
-    /// True if no road was sent, or only one that is too old.
+    /// True if no road was sent, or only a road that is too old.
     pub fn lacks_road(&self) -> bool {
         self.source == RoadSource::None || self.violated(Condition::Age)
     }
@@ -164,8 +165,8 @@ pub fn divergence(votes: &[f32]) -> Option<f64> {
 }
 
 /// Largest curvature of a line of two or more points over `ahead_m` from its point nearest to the ego origin, 1/m. The
-/// curvature at a position is that of the circle through it and the positions [`BASE_M`] before and behind it on the
-/// line.
+/// curvature at a position is the curvature of the circle through it and the positions [`BASE_M`] before and behind it
+/// on the line.
 pub fn curvature_ahead_per_m(line: &[[f64; 2]], ahead_m: f64) -> f64 {
     let (nearest_pair, nearest_share) = nearest_to_origin(line);
     // Samples at equal steps from BASE_M before the nearest point to BASE_M beyond the end.
@@ -253,7 +254,7 @@ fn curvature_per_m([a, b, c]: [[f64; 2]; 3]) -> f64 {
     let side = |p: [f64; 2], q: [f64; 2]| libm::hypot(q[0] - p[0], q[1] - p[1]);
     let twice_area = ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
     let sides = side(a, b) * side(b, c) * side(a, c);
-    // Two of the positions are equal, because the line turns back on itself: the curvature is that of a circle whose
+    // Two of the positions are equal, because the line turns back on itself: it is the curvature of a circle whose
     // radius is half of BASE_M.
     if sides > 0.0 { 2.0 * twice_area / sides } else { 2.0 / BASE_M }
 }

@@ -7,7 +7,7 @@ use crate::layer::roughness::RoughnessSums;
 
 use super::config::{ROUGHNESS_ROUGH, ROUGHNESS_SMOOTH, SpeedConfig};
 
-/// Least number of points with a deviation in a cell with a roughness. Ours: that of the layer `terrain`.
+/// Least number of points with a deviation in a cell with a roughness. Ours: the number of the layer `terrain`.
 const POINTS_MIN: u16 = 4;
 
 /// Factor of the speed above `crawl_mps` of a cell: 1 on smooth ground and without a known roughness, `rough_share` on

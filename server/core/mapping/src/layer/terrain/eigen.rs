@@ -1,10 +1,10 @@
 //! Principal components of a covariance matrix, in closed form.
 //!
-//! In: variances xx, yy, zz and covariances xy, xz, yz, m². Out: the eigenvalues, and which of them belongs to the most
-//! vertical eigenvector (Neuhaus 2009, eq. 1). The matrix is scaled first; then the characteristic polynomial is solved
-//! trigonometrically in f64. Newton's method finds the cosine of a third of the angle, because the last bits of the
-//! system's `acos` and `cos` differ from machine to machine. The vertical component of an eigenvector follows from the
-//! eigenvalues of the matrix and of its horizontal part, so that no eigenvector is computed.
+//! In: variances xx, yy, zz and covariances xy, xz, yz, m². Out: the eigenvalues, and which eigenvalue belongs to the
+//! most vertical eigenvector (Neuhaus 2009, eq. 1). The matrix is scaled first; then the characteristic polynomial is
+//! solved trigonometrically in f64. Newton's method finds the cosine of a third of the angle, because the last bits of
+//! the system's `acos` and `cos` differ from machine to machine. The vertical component of an eigenvector follows from
+//! the eigenvalues of the matrix and of its horizontal part, so that no eigenvector is computed.
 
 /// Least difference between two distinct eigenvalues, relative to the largest entry. Ours: below it, rounding decides
 /// which eigenvector belongs to which value.

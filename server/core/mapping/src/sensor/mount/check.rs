@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::median::{weighted_median, weighted_std};
 use crate::sensor::sweep::Sweep;
 
-/// Number of scans of which the medians are formed. Ours: ten seconds at 10 Hz, longer than a vehicle brakes.
+/// Number of scans whose medians are formed. Ours: ten seconds at 10 Hz, longer than a vehicle brakes.
 const SCANS_MAX: usize = 100;
 /// Least number of scans with ground before the mount is judged. Ours: two seconds at 10 Hz.
 const SCANS_MIN: usize = 20;

@@ -177,8 +177,8 @@ where
 }
 
 /// The median of values with standard deviations, weighted by the inverse of their variances, and its standard
-/// deviation: that of a single value together with the spread of the values. The spread is not divided by their number,
-/// because revolutions that follow each other see the same road.
+/// deviation: the deviation of a single value together with the spread of the values. The spread is not divided by
+/// their number, because revolutions that follow each other see the same road.
 fn combined(mut values: Vec<[f64; 2]>) -> [f64; 2] {
     values.sort_by(|a, b| a[0].total_cmp(&b[0]));
     let weighted: Vec<[f64; 2]> = values.iter().map(|[value, std]| [*value, 1.0 / (std * std)]).collect();

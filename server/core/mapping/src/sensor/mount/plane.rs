@@ -1,8 +1,8 @@
 //! The plane on which the vehicle stands, from the points of one revolution.
 //!
 //! In: points, sensor frame, metres. Out: a [`PlaneEstimate`]. Candidates are planes through three of the lowest points
-//! of cells, drawn with a fixed seed; the one with the most weight of cells is refined by weighted least squares with
-//! Tukey's loss. The uncertainty is that of the jackknife: how much the plane moves if all points of one of twelve
+//! of cells, drawn with a fixed seed; the plane with the most weight of cells is refined by weighted least squares with
+//! Tukey's loss. The uncertainty is found by the jackknife: how much the plane moves if all points of one of twelve
 //! directions are left out.
 
 use nalgebra::{Matrix3, Vector3};

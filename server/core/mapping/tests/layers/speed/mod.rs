@@ -423,7 +423,7 @@ proptest! {
 #[test]
 fn rough_ground_is_slower_than_smooth_ground_of_the_same_height() {
     let mut sweep = level();
-    // The deviations on the left are those of a field, on the right those of a road.
+    // The left has the deviations of a field, the right the deviations of a road.
     let share = |i: usize| if sweep.y[i] < 0.0 { 0.0 } else { 0.02 * (-1.0_f32).powi(i as i32) };
     sweep.deviation = (0..sweep.x.len()).map(|i| Deviation::new(share(i), 0.001)).collect();
     let at = |config: &SpeedConfig, y: f32| {

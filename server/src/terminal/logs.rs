@@ -14,7 +14,7 @@ use tracing_subscriber::layer::{Context, Layer};
 use tracing_subscriber::prelude::*;
 use tracing_subscriber::{EnvFilter, fmt};
 
-use crate::cli::shared::output::usage_error;
+use super::usage::usage_error;
 use clearway_daemon::base::sync::locked;
 
 /// Most lines of one kind in a [`PERIOD`]. Ours: a start names each sensor and address once.

@@ -1,9 +1,8 @@
-//! Options that several subcommands share: the configuration file, how a sensor is mounted.
+//! The options that name a configuration file -> the configuration.
 
 use std::path::PathBuf;
 
 use clap::Args;
-use clearway_mapping::config::Extrinsics;
 
 use clearway_daemon::config::{Config, ConfigError, Origin, of_environment};
 
@@ -50,33 +49,4 @@ impl ConfigurationOptions {
 /// contradicts no option.
 fn default_file() -> PathBuf {
     std::env::var_os("CLEARWAY_CONFIG").map_or_else(|| PathBuf::from("clearway.toml"), PathBuf::from)
-}
-
-/// Reads extrinsics from the command line: six numbers, separated by commas.
-///
-/// # Errors
-/// If there are not six numbers.
-pub fn extrinsics(text: &str) -> Result<Extrinsics, String> {
-    let numbers: Vec<f64> = text.split(',').filter_map(|number| number.trim().parse().ok()).collect();
-    match numbers[..] {
-        [x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg] if text.split(',').count() == 6 => {
-            Ok(Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg })
-        }
-        _ => Err("six numbers are needed: x,y,z in metres, roll,pitch,yaw in degrees".into()),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn extrinsics_are_six_numbers_in_metres_and_degrees() {
-        let given = extrinsics("1,-0.5,1.9,0,-2.5,90").unwrap();
-        assert_eq!((given.x_m, given.y_m, given.z_m), (1.0, -0.5, 1.9));
-        assert_eq!((given.roll_deg, given.pitch_deg, given.yaw_deg), (0.0, -2.5, 90.0));
-        for wrong in ["", "1,2,3", "1,2,3,4,5,6,7", "1,2,3,4,5,x,6"] {
-            assert!(extrinsics(wrong).is_err(), "{wrong}");
-        }
-    }
 }

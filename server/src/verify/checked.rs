@@ -8,8 +8,7 @@ use std::time::Instant;
 
 use anyhow::{Result, bail};
 
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{counted, with_causes};
+use crate::terminal::{Exit, counted, with_causes};
 use clearway_daemon::base::sync::locked;
 use clearway_daemon::config::{Calibrations, Config};
 use clearway_daemon::record::{recorded_config, recorded_vehicles, run_config, verify};
@@ -81,25 +80,18 @@ impl Checked {
 
     /// Why the file was not checked; `None` if it was.
     pub fn not_checked(&self) -> Option<&String> {
-        match &self.outcome {
-            CheckOutcome::Unreadable(reason) => Some(reason),
-            CheckOutcome::Verified(_) | CheckOutcome::Compared(_) => None,
-        }
+        let CheckOutcome::Unreadable(reason) = &self.outcome else { return None };
+        Some(reason)
     }
 
     /// True if the maps that were compared are equal, and the file is not whole.
     pub fn is_equal_but_not_whole(&self) -> bool {
-        let incomplete = match &self.outcome {
-            CheckOutcome::Verified(report) => report.incomplete.as_ref(),
-            CheckOutcome::Compared(comparison) => comparison.incomplete.as_ref(),
-            CheckOutcome::Unreadable(_) => None,
+        let (incomplete, maps) = match &self.outcome {
+            CheckOutcome::Verified(report) => (&report.incomplete, report.equal),
+            CheckOutcome::Compared(comparison) => (&comparison.incomplete, comparison.before + comparison.after),
+            CheckOutcome::Unreadable(_) => return false,
         };
-        let is_empty = match &self.outcome {
-            CheckOutcome::Verified(report) => report.equal == 0,
-            CheckOutcome::Compared(comparison) => comparison.before + comparison.after == 0,
-            CheckOutcome::Unreadable(_) => true,
-        };
-        self.exit() == Exit::Unreadable && incomplete.is_some() && !is_empty
+        self.exit() == Exit::Unreadable && incomplete.is_some() && maps > 0
     }
 
     /// True if the whole file was checked and all its maps are equal.
@@ -147,7 +139,7 @@ fn check_one(file: &Path, check: &Check) -> Checked {
 fn outcome_of(file: &Path, check: &Check) -> Result<CheckOutcome> {
     #[cfg(feature = "store")]
     if let Some(url) = file.to_str().filter(|text| super::files::is_url(text)) {
-        let copy = crate::cli::shared::output::block_on(clearway_daemon::store::fetch::fetch(url))?;
+        let copy = crate::process::block_on(clearway_daemon::store::fetch::fetch(url))?;
         // A reason names the copy, which is gone when it is read.
         return outcome(copy.path(), check)
             .map_err(|error| anyhow::anyhow!(with_causes(&error).replace(&copy.path().display().to_string(), url)));

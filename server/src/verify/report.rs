@@ -9,8 +9,7 @@ use anyhow::{Context as _, Result, bail};
 use serde_json::{Value, json};
 
 use super::checked::{CheckOutcome, Checked};
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::counted;
+use crate::terminal::{Exit, counted};
 use clearway_journal::RecordedMaps;
 use clearway_journal::compare::{Comparison, LayerChange, MapChange};
 

@@ -4,8 +4,7 @@ use std::fmt::Write as _;
 
 use super::checked::{Check, CheckOutcome, Checked};
 use super::report::reason;
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::counted;
+use crate::terminal::{Exit, counted};
 use clearway_journal::compare::{Comparison, LayerChange};
 
 /// Greatest number of pairs of classes that are listed for a layer, the most frequent first.
@@ -20,7 +19,6 @@ pub fn text(results: &[Checked], check: &Check) -> String {
     }
     for result in results {
         let name = result.file.display().to_string();
-        let none = || [String::new(), String::new(), String::new(), String::new()];
         let [events, maps, layers, cells] = match &result.outcome {
             CheckOutcome::Verified(report) => {
                 [report.events, report.maps, report.equal, report.cells].map(|count| count.to_string())
@@ -29,7 +27,7 @@ pub fn text(results: &[Checked], check: &Check) -> String {
                 let sum = |of: fn(&LayerChange) -> u64| comparison.layers.values().map(of).sum::<u64>().to_string();
                 [String::new(), String::new(), sum(|layer| layer.maps), sum(|layer| layer.cells)]
             }
-            CheckOutcome::Unreadable(_) => none(),
+            CheckOutcome::Unreadable(_) => Default::default(),
         };
         write_line(&mut text, width, [name, events, maps, layers, cells], &reason(&result.outcome));
         match &result.outcome {

@@ -72,7 +72,7 @@ pub fn is_url(text: &str) -> bool {
 /// The URLs of the recordings that the URL of a store names.
 #[cfg(feature = "store")]
 fn in_store(url: &str) -> Result<Vec<PathBuf>> {
-    let found = crate::cli::shared::output::block_on(clearway_daemon::store::fetch::list(url))?;
+    let found = crate::process::block_on(clearway_daemon::store::fetch::list(url))?;
     if found.is_empty() {
         bail!("{url}: no recording *.mcap in this store");
     }

@@ -1,13 +1,5 @@
 //! `clearway verify`: recordings -> whether each of their maps is the map of its events, or what a change of the
 //! configuration or of the program changed in them.
-//!
-//! | file | in -> out |
-//! |---|---|
-//! | `files` | paths and patterns of the command line, a shard -> files |
-//! | `checked` | files -> the result of each, several at a time |
-//! | `same_drive` | two recordings -> whether they are of one drive |
-//! | `table` | results -> text |
-//! | `report` | results -> JSON, JUnit XML |
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -15,17 +7,11 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 
-use self::checked::{Check, Checked, NewConfig};
-use self::files::Shard;
-use crate::cli::shared::exit::Exit;
-use crate::cli::shared::files as one_file;
-use crate::cli::shared::output::{print, print_line, printable};
-
-mod checked;
-mod files;
-mod report;
-mod same_drive;
-mod table;
+use crate::terminal::{Exit, print, print_line, printable};
+use crate::verify::checked::{Check, Checked, NewConfig, check_all};
+use crate::verify::files::{Shard, find};
+use crate::verify::{report, table};
+use clearway_daemon::base::files;
 
 /// Compute every map of recordings again from their events, and name the first differences.
 ///
@@ -94,19 +80,16 @@ impl ChangeArguments {
 
 /// Checks the files and prints the results. The exit code is 2 if a file cannot be checked as a whole, else 1 if a map
 /// differs.
-///
-/// # Errors
-/// If the configuration is wrong, or a report cannot be written.
 pub fn run(options: &VerifyArguments) -> Result<Exit> {
     let check = options.change.check()?;
     options.junit.as_deref().map_or(Ok(()), report::check_junit)?;
-    let results = match files::find(&options.files, options.shard) {
-        Ok(files) => checked::check_all(&files, &check),
+    let results = match find(&options.files, options.shard) {
+        Ok(files) => check_all(&files, &check),
         // In the reports too: a machine that collects them has to find the reason.
         Err(error) => vec![Checked::not_found(&options.files, format!("{error:#}"))],
     };
     if let Some(file) = &options.junit {
-        one_file::write(file, report::junit(&results).as_bytes())?;
+        files::write(file, report::junit(&results).as_bytes())?;
     }
     let reasons: Vec<&String> = results.iter().filter_map(Checked::not_checked).collect();
     let different: BTreeSet<&String> = reasons.iter().copied().collect();

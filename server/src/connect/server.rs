@@ -7,8 +7,8 @@ use anyhow::{Error, Result};
 use clap::Args;
 use clearway_client::{Client, ClientError, Tls};
 
-use crate::cli::shared::files;
-use crate::cli::shared::output::usage_error;
+use crate::terminal::usage_error;
+use clearway_daemon::base::files;
 
 /// The gRPC address of a server with the default configuration.
 const ADDRESS: &str = "localhost:50051";
@@ -55,6 +55,11 @@ impl ServerOptions {
         };
         connected.map_err(advice)
     }
+
+    #[cfg(not(feature = "zenoh"))]
+    pub async fn connect_over_zenoh(&self, endpoint: &str) -> Result<Client> {
+        anyhow::bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
+    }
 }
 
 /// The certificates that the environment variables name; `None` without a CA: the connection is not encrypted then.
@@ -79,8 +84,7 @@ fn tls() -> Result<Option<Tls>> {
 
 /// Adds to an error of the client what to do about it, if that is known.
 pub fn explain(error: ClientError) -> Error {
-    let text = error.to_string();
-    let advice = advice(&text);
+    let advice = advice(&error.to_string());
     let error = Error::from(error);
     match advice {
         Some(advice) => error.context(advice),
@@ -88,50 +92,42 @@ pub fn explain(error: ClientError) -> Error {
     }
 }
 
-/// What to do about an error of this text; `None` if the text says all that is known.
-fn advice(error: &str) -> Option<&'static str> {
-    let is_http = ["invalid compression flag", "HTTP status code", "http2 error", "h2 protocol error"];
-    if is_http.iter().any(|part| error.contains(part)) {
-        return Some(
-            "something answers at this address, but not a gRPC server: --server needs the address of [grpc] listen \
-             (port 50051 by default), not the one of the page ([page] listen, port 8080 by default)",
-        );
-    }
-    if error.contains("what answers there encrypts") {
-        return Some(
-            "if the server encrypts, CLEARWAY_CA names the PEM file of the CA certificate that signed its own",
-        );
-    }
-    if error.contains("UnknownIssuer") {
-        return Some("the CA certificate of CLEARWAY_CA has not signed the server's certificate");
-    }
-    if error.contains("KeyMismatch") {
-        return Some("CLEARWAY_KEY is not the private key of the certificate of CLEARWAY_CERT");
-    }
-    if error.contains("CertificateRequired") {
-        return Some("the server requires a certificate: CLEARWAY_CERT and CLEARWAY_KEY name it and its key");
-    }
-    if ["CertificateUnknown", "CertificateExpired", "UnknownCA", "BadCertificate"]
-        .iter()
-        .any(|part| error.contains(part))
-    {
-        return Some(
-            "the server does not accept the certificate of CLEARWAY_CERT: its own CA must have signed it, and it must be valid now",
-        );
-    }
+/// Parts of the texts of errors, and what to do about an error with one of them; the first that fits holds.
+const ADVICE: [(&[&str], &str); 8] = [
+    (
+        &["invalid compression flag", "HTTP status code", "http2 error", "h2 protocol error"],
+        "something answers at this address, but not a gRPC server: --server needs the address of [grpc] listen (port \
+         50051 by default), not the one of the page ([page] listen, port 8080 by default)",
+    ),
+    (
+        &["what answers there encrypts"],
+        "if the server encrypts, CLEARWAY_CA names the PEM file of the CA certificate that signed its own",
+    ),
+    (&["UnknownIssuer"], "the CA certificate of CLEARWAY_CA has not signed the server's certificate"),
+    (&["KeyMismatch"], "CLEARWAY_KEY is not the private key of the certificate of CLEARWAY_CERT"),
+    (&["CertificateRequired"], "the server requires a certificate: CLEARWAY_CERT and CLEARWAY_KEY name it and its key"),
+    (
+        &["CertificateUnknown", "CertificateExpired", "UnknownCA", "BadCertificate"],
+        "the server does not accept the certificate of CLEARWAY_CERT: its own CA must have signed it, and it must be \
+         valid now",
+    ),
     // A server that refuses a client may close the connection before the alert that says why arrives.
-    let ended = ["connection closed", "broken pipe", "operation was canceled", "transport error"];
-    if ended.iter().any(|part| error.contains(part)) {
-        return Some(
-            "the connection has ended: the server has stopped, encrypts (CLEARWAY_CA), requires a certificate (CLEARWAY_CERT and \
-             CLEARWAY_KEY) or does not accept this one, or has another port for gRPC",
-        );
-    }
-    let has_no_map = error.contains("no map");
-    has_no_map.then_some(
+    (
+        &["connection closed", "broken pipe", "operation was canceled", "transport error"],
+        "the connection has ended: the server has stopped, encrypts (CLEARWAY_CA), requires a certificate \
+         (CLEARWAY_CERT and CLEARWAY_KEY) or does not accept this one, or has another port for gRPC",
+    ),
+    (
+        &["no map"],
         "the server has no map to give: no packet or scan has arrived since it started, or none arrives now; \
          `clearway status` says why, and `clearway get --wait` and `clearway watch` wait for the next map",
-    )
+    ),
+];
+
+/// What to do about an error of this text; `None` if the text says all that is known.
+fn advice(error: &str) -> Option<&'static str> {
+    let fits = |parts: &[&str]| parts.iter().any(|part| error.contains(part));
+    ADVICE.iter().find(|(parts, _)| fits(parts)).map(|(_, advice)| *advice)
 }
 
 #[cfg(test)]

@@ -1,30 +1,14 @@
-//! Files, by the endings of their names -> observations and the stamps at which they are sent.
+//! Files, by the endings of their names -> what is sent, and the stamps at which it is sent.
 
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use clearway_client::observation::{RoadFrame, RoadPurpose};
-use clearway_client::{Observation, now_ns};
-use clearway_lidar::capture::{Capture, CaptureError, Datagram};
-use clearway_lidar::capture_sensor::CaptureSensor;
-use clearway_mapping::event::{Road, RoadPurpose as Purpose};
-use clearway_mapping::road::rddf::Rddf;
-use clearway_mapping::road::rndf::Rndf;
-use clearway_mapping::road::{FOOT_M, LineError, LocalFrame};
-use clearway_mapping::scan_file;
+use clearway_client::now_ns;
+use clearway_daemon::base::files;
 
-use crate::cli::shared::files;
-use crate::cli::shared::output::{counted, usage_error};
-
-/// Most datagrams of a drive in one observation: 50 ms of an HDL-64E.
-const PACKETS: usize = 175;
-/// Longest time between the first and the last datagram of one observation, in nanoseconds; ours, because it delays
-/// each packet by as much.
-const PACKETS_NS: i64 = 20_000_000;
-/// Width of an RNDF lane without a width, in metres: 12 feet, the width of most lanes.
-const LANE_M: f64 = 12.0 * FOOT_M;
+use super::items::{IngestItem, read_poses, read_road};
+use crate::terminal::{counted, usage_error};
 
 /// Scans a second if the options do not give them, as of most rotating sensors at 600 rpm.
 const HZ: f64 = 10.0;
@@ -73,44 +57,6 @@ pub struct IngestPlan {
     pub notes: Vec<String>,
 }
 
-/// One observation to send.
-pub enum IngestItem {
-    /// Position in the map frame in metres, quaternion x y z w, forward speed in m/s.
-    Pose([f64; 3], [f64; 4], f64),
-    /// A road in the map frame.
-    Road(Road),
-    /// The file of a scan.
-    Scan(PathBuf),
-}
-
-impl IngestItem {
-    /// The kind of the item, and its observation.
-    ///
-    /// # Errors
-    /// If the file of a scan cannot be read.
-    pub fn read(&self, sensor: &str, stamp_ns: i64) -> Result<(&'static str, Observation)> {
-        Ok(match self {
-            Self::Pose(at, turned, speed_mps) => ("poses", Observation::pose(stamp_ns, *at, *turned, *speed_mps)),
-            Self::Road(road) => {
-                let points: Vec<[f64; 3]> =
-                    road.points.iter().zip(&road.widths_m).map(|(&[x, y], &width)| [x, y, width]).collect();
-                let purpose = match road.purpose {
-                    Purpose::Paint => RoadPurpose::Paint,
-                    Purpose::Route => RoadPurpose::Route,
-                };
-                ("roads", Observation::road(stamp_ns, purpose, RoadFrame::Map, &points))
-            }
-            Self::Scan(file) => {
-                let bytes = files::read(file)?;
-                let scan = scan_file::read(&file.to_string_lossy(), &bytes);
-                let (_, scan) = scan.with_context(|| file.display().to_string())?;
-                let observation = Observation::scan(sensor, stamp_ns, &scan.x, &scan.y, &scan.z);
-                ("scans", observation.intensity(&scan.intensity).rings(&scan.ring))
-            }
-        })
-    }
-}
-
 fn ending(file: &Path) -> &str {
     file.extension().and_then(|extension| extension.to_str()).unwrap_or("")
 }
@@ -130,7 +76,7 @@ impl IngestPlan {
                 "pcap" | "pcapng" => drives.push(file.clone()),
                 "tum" => poses.extend(read_poses(&text()?).with_context(|| file.display().to_string())?),
                 "rddf" | "rndf" => {
-                    let (road, refused) = read_road(&text()?, ending(file), options);
+                    let (road, refused) = read_road(&text()?, ending(file), options.origin, options.lane.as_deref());
                     notes.extend(refused.iter().map(|line| format!("{}: {line}", file.display())));
                     roads.push(road.with_context(|| file.display().to_string())?);
                 }
@@ -171,120 +117,10 @@ impl IngestPlan {
         items.sort_by_key(|(stamp_ns, item)| (*stamp_ns, matches!(item, IngestItem::Scan(_))));
         Ok(Self { items, drives, notes })
     }
-}
 
-/// Reads lines of "seconds x y z qx qy qz qw". The speed of each pose is that from the pose before it.
-fn read_poses(text: &str) -> Result<Vec<(i64, IngestItem)>> {
-    let mut poses: Vec<(i64, [f64; 7])> = Vec::new();
-    for (index, line) in text.lines().enumerate() {
-        let line = line.split('#').next().unwrap_or("").trim();
-        if line.is_empty() {
-            continue;
-        }
-        let numbers: Vec<f64> = line.split_whitespace().filter_map(|number| number.parse().ok()).collect();
-        let [seconds, rest @ ..] = &numbers[..] else {
-            bail!("line {}: {line:?}: eight numbers are needed", index + 1)
-        };
-        let Ok(pose) = <[f64; 7]>::try_from(rest) else {
-            bail!("line {}: {line:?}: eight numbers are needed", index + 1)
-        };
-        poses.push(((seconds * 1e9).round() as i64, pose));
-    }
-    let speed_mps = |from: &(i64, [f64; 7]), to: &(i64, [f64; 7])| {
-        let [dx, dy, dz] = [0, 1, 2].map(|axis| to.1[axis] - from.1[axis]);
-        let seconds = to.0.saturating_sub(from.0) as f64 * 1e-9;
-        let [qx, qy, qz, qw] = [3, 4, 5, 6].map(|axis| to.1[axis]);
-        // The distance driven along the vehicle's x axis; backwards is negative.
-        let forward = [1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy + qw * qz), 2.0 * (qx * qz - qw * qy)];
-        let driven_m = dx * forward[0] + dy * forward[1] + dz * forward[2];
-        if seconds > 0.0 { driven_m / seconds } else { 0.0 }
-    };
-    let item = |index: usize| {
-        let (stamp_ns, [x, y, z, qx, qy, qz, qw]) = poses[index];
-        let (from, to) = if index > 0 { (index - 1, index) } else { (0, 1.min(poses.len() - 1)) };
-        (stamp_ns, IngestItem::Pose([x, y, z], [qx, qy, qz, qw], speed_mps(&poses[from], &poses[to])))
-    };
-    Ok((0..poses.len()).map(item).collect())
-}
-
-/// Reads the route of an RDDF, or one lane of an RNDF to paint; returns also the lines that are left out.
-fn read_road(text: &str, ending: &str, options: &FileOptions) -> (Result<Road>, Vec<LineError>) {
-    let frame = |frame_of_file: Option<LocalFrame>| match options.origin {
-        Some([latitude, longitude]) => Some(LocalFrame::new(latitude, longitude)),
-        None => frame_of_file,
-    };
-    if ending == "rddf" {
-        let rddf = Rddf::read(text);
-        let road = frame(rddf.local_frame()).map(|frame| rddf.road(&frame, Purpose::Route, 0));
-        return (road.context("no row of a route"), rddf.refused);
-    }
-    let mut rndf = Rndf::read(text);
-    let names: Vec<String> = rndf.lanes.iter().map(|lane| lane.name.clone()).collect();
-    let frame = frame(rndf.local_frame());
-    let lane = match &options.lane {
-        None => rndf.lanes.first(),
-        Some(name) => rndf.lanes.iter().find(|lane| lane.name == *name),
-    };
-    let road = lane.zip(frame).and_then(|(lane, frame)| lane.road(&frame, Some(LANE_M), 0));
-    let road = road.with_context(|| format!("no such lane with two points; lanes: {}", names.join(", ")));
-    (road, std::mem::take(&mut rndf.refused))
-}
-
-/// Datagrams with their stamps, in nanoseconds since the Unix epoch.
-type StampedPackets = Vec<(i64, Vec<u8>)>;
-
-/// The datagrams of one sensor of a capture, in groups that make one observation each: an iterator. A capture that is
-/// cut off gives the groups before the cut.
-pub struct PacketGroups {
-    capture: Capture<'static>,
-    /// The datagram that begins the next group.
-    pending: Option<Result<Datagram, CaptureError>>,
-    sensor: CaptureSensor,
-}
-
-impl PacketGroups {
-    /// Opens a capture.
-    ///
-    /// # Errors
-    /// If the file cannot be read.
-    pub fn open(file: &Path) -> Result<Self> {
-        let (opened, _) = files::open(file)?;
-        let capture = Capture::new(BufReader::new(opened)).with_context(|| file.display().to_string())?;
-        Ok(Self { capture, pending: None, sensor: CaptureSensor::default() })
-    }
-
-    /// The datagrams of other sensors, and the packets that are no UDP datagrams, so far; for people.
-    pub fn notes(&self) -> Vec<String> {
-        self.sensor.notes().into_iter().chain(self.capture.skipped().notes()).collect()
-    }
-}
-
-impl Iterator for PacketGroups {
-    type Item = Result<StampedPackets, CaptureError>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        let mut packets = StampedPackets::new();
-        while packets.len() < PACKETS {
-            let first_ns = packets.first().map(|(stamp_ns, _)| *stamp_ns);
-            let near =
-                |stamp_ns: i64| first_ns.is_none_or(|first| (0..=PACKETS_NS).contains(&stamp_ns.saturating_sub(first)));
-            let is_next = |next: &Result<Datagram, CaptureError>| {
-                packets.is_empty() || next.as_ref().is_ok_and(|d| near(d.stamp_ns))
-            };
-            match self.pending.take().or_else(|| self.capture.next()) {
-                Some(next) if !is_next(&next) => {
-                    self.pending = Some(next);
-                    break;
-                }
-                Some(Ok(datagram)) if self.sensor.has_sent(&datagram) => {
-                    packets.push((datagram.stamp_ns, datagram.payload));
-                }
-                Some(Ok(_)) => {}
-                Some(Err(CaptureError::Truncated { .. })) | None => break,
-                Some(Err(error)) => return Some(Err(error)),
-            }
-        }
-        (!packets.is_empty()).then_some(Ok(packets))
+    /// True if there are scans or drives, which have a sensor.
+    pub fn has_sensors(&self) -> bool {
+        !self.drives.is_empty() || self.items.iter().any(|(_, item)| matches!(item, IngestItem::Scan(_)))
     }
 }
 

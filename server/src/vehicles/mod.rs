@@ -1,0 +1,4 @@
+//! The state of vehicles for people.
+
+pub mod servers;
+pub mod table;
