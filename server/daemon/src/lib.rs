@@ -8,7 +8,7 @@
 //! | [`config`] | one TOML file -> vehicles, sources, publishers, recorder |
 //! | [`ingest`] | datagrams, observations, ROS 2 messages -> numbered events on one queue a vehicle |
 //! | [`engine`] | events -> journal, step of the pipeline, encoded maps, of the layers that readers want |
-//! | [`encode`] | map -> pictures, clouds and grids of viewers: the page, Foxglove, ROS 2 |
+//! | [`viewer`] | map -> pictures, clouds and grids of viewers: the page, Foxglove, ROS 2 |
 //! | [`fleet`] | announcements of other servers -> their vehicles, and where they are served |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file |
@@ -22,7 +22,6 @@
 
 pub mod base;
 pub mod config;
-pub mod encode;
 pub mod engine;
 pub mod fleet;
 pub mod ingest;
@@ -34,5 +33,6 @@ pub mod status;
 #[cfg(feature = "store")]
 pub mod store;
 pub mod traces;
+pub mod viewer;
 #[cfg(feature = "zenoh")]
 pub mod zenoh_session;

@@ -7,11 +7,11 @@ use std::process::Stdio;
 
 use clearway_client::{MapView, SafePoint};
 use clearway_daemon::config::{Config, Foxglove, Ros2};
-use clearway_daemon::encode::viewer::Raster;
-use clearway_daemon::encode::viewer::aligned::AlignedGrid;
 use clearway_daemon::ingest::queue::Reading;
 use clearway_daemon::run::{Running, Server, Setup};
 use clearway_daemon::status::Transport;
+use clearway_daemon::viewer::Raster;
+use clearway_daemon::viewer::aligned::AlignedGrid;
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
 use clearway_tests::workspace;

@@ -33,11 +33,11 @@ use super::listen::{CallPermit, ConnectionSlot, Listener, READ_BUFFER_BYTES};
 use super::served::{Served, Vehicles};
 use crate::base::clock::now_ns;
 use crate::base::token_bucket::TokenBucket;
-use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths, view};
 use crate::engine::newest::NewestSweep;
 use crate::engine::subscriptions::LayerSubscription;
 use crate::status::{Reader, Transport};
+use crate::viewer::raster::Rasters;
+use crate::viewer::{base_frame, foxglove as messages, safe_paths, view};
 use clearway_journal::encode::EncodedMap;
 
 /// Pages from which Foxglove connects, beside the configured pages.

@@ -16,9 +16,9 @@
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
-use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::ros::{self, LayerTopic, ShownLayer};
-use crate::encode::viewer::view;
+use crate::viewer::raster::Rasters;
+use crate::viewer::ros::{self, LayerTopic, ShownLayer};
+use crate::viewer::view;
 use clearway_proto::v1;
 use clearway_ros::cdr::{Header, Writer};
 use clearway_ros::published::diagnostics::{Diagnostic, DiagnosticLevel, diagnostic_array_to_cdr};

@@ -6,11 +6,11 @@ use tokio::sync::watch;
 
 use crate::base::directory::{UnknownNameError, find_vehicle, shortened};
 use crate::config::Ros;
-use crate::encode::viewer::FrameNames;
 use crate::engine::newest::Newest;
 use crate::engine::wires::Wires;
 use crate::publish::listen::access::Caller;
 use crate::status::VehicleStatus;
+use crate::viewer::FrameNames;
 
 /// One vehicle, as publishers use it.
 #[derive(Clone, Debug)]

@@ -1,6 +1,6 @@
 //! The pixels of a picture: rectangles, text and other pictures in it, and the picture as a PNG.
 
-use clearway_daemon::encode::palette::Rgb;
+use clearway_daemon::viewer::palette::Rgb;
 use font8x8::legacy::BASIC_LEGACY;
 
 /// Width and height of a letter, in dots.

@@ -1,6 +1,6 @@
 //! The lines under a map: the caption, what its colours mean, and a scale bar.
 
-use clearway_daemon::encode::palette::{Rgb, scale_colour};
+use clearway_daemon::viewer::palette::{Rgb, scale_colour};
 
 use super::image::{LETTER, Picture};
 

@@ -18,9 +18,9 @@ mod legend;
 use std::time::{Duration, UNIX_EPOCH};
 
 use anyhow::{Context, Result};
-use clearway_daemon::encode::colours::{Colours, UNKNOWN};
-use clearway_daemon::encode::palette::Rgb;
-use clearway_daemon::encode::viewer::safe_paths;
+use clearway_daemon::viewer::colours::{Colours, UNKNOWN};
+use clearway_daemon::viewer::palette::Rgb;
+use clearway_daemon::viewer::safe_paths;
 use clearway_proto::map::{Layer, SafePoint};
 use clearway_proto::{plan, v1};
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use clearway_daemon::config::{COMMENTED, Config};
-use clearway_daemon::encode::viewer::ros::topics_of;
+use clearway_daemon::viewer::ros::topics_of;
 use clearway_tests::workspace;
 use serde_yaml_ng::Value;
 

@@ -6,9 +6,9 @@ mod files;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4};
 
 use clearway_client::MapView;
-use clearway_daemon::encode::viewer::FrameNames;
-use clearway_daemon::encode::viewer::raster::Raster;
-use clearway_daemon::encode::viewer::ros::{ShownLayer, topics_of};
+use clearway_daemon::viewer::FrameNames;
+use clearway_daemon::viewer::raster::Raster;
+use clearway_daemon::viewer::ros::{ShownLayer, topics_of};
 use clearway_proto::codec::{CellsRef, encode_grid};
 use clearway_proto::legend::encode_legend;
 use clearway_proto::map::{encode_header, encode_layer};

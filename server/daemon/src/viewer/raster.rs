@@ -22,7 +22,7 @@ use clearway_proto::map::Layer;
 use clearway_proto::v1::ClassMeaning;
 use nalgebra::{Isometry3, Vector3};
 
-use crate::encode::colours::Colours;
+use crate::viewer::colours::Colours;
 
 /// Edge of the cells to which radial layers are resampled, in metres, equal to the cells of the other layers.
 const CELL_M: f64 = 0.25;

@@ -1,4 +1,4 @@
-//! Maps for ROS 2 and Foxglove: messages of one [`MapView`].
+//! Maps for viewers: colours for the page and pictures, messages of one [`MapView`] for ROS 2 and Foxglove.
 //!
 //! Frames: Foxglove's grids and points lie in `<vehicle>/base_link`, the ego frame; if poses are known, that frame in
 //! `map`. ROS 2 has the frames of the vehicle's input ([`FrameNames`]); its grids lie in the fixed frame if a pose is
@@ -6,6 +6,8 @@
 //!
 //! | file | in -> out |
 //! |---|---|
+//! | [`palette`] | a value or an id -> its colour |
+//! | [`colours`] | a layer -> the colour of each cell |
 //! | [`raster`] | a layer -> square cells, as occupancies or colours |
 //! | [`aligned`] | square cells and their pose -> cells along the axes of a frame |
 //! | [`clouds`] | a layer of squares -> points that mark and clear |
@@ -16,8 +18,10 @@
 
 pub mod aligned;
 pub mod clouds;
+pub mod colours;
 pub mod foxglove;
 pub mod frame;
+pub mod palette;
 pub mod raster;
 pub mod ros;
 pub mod safe_paths;
