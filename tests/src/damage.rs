@@ -202,16 +202,13 @@ impl Copy {
         let name = self.file.display().to_string();
         let mut reader = match McapReader::open(&self.file) {
             Ok(reader) => reader,
-            // Its first bytes, or the version in its metadata, are changed.
-            Err(error @ (McapReadError::NotMcap { .. } | McapReadError::Version { .. })) => {
-                let is_named = error.to_string().contains(&name);
-                let refused = DamageOutcome { refused: true, ..DamageOutcome::default() };
-                return if is_named { Ok(refused) } else { Err(format!("{error} does not name {name}")) };
-            }
-            Err(error) => return Err(error.to_string()),
+            Err(error) => return refused(&error, &name),
         };
         let messages = reader.by_ref().map(|message| message.map(|message| hash(&message)));
-        let messages = messages.collect::<Result<Vec<_>, _>>().map_err(|error| error.to_string())?;
+        let messages = match messages.collect::<Result<Vec<_>, _>>() {
+            Ok(messages) => messages,
+            Err(error) => return refused(&error, &name),
+        };
         reader.incomplete().ok_or("the change is not named")?;
         let lost = original.messages.len().checked_sub(messages.len()).ok_or("more messages than were recorded")?;
         let same = original.messages.iter().zip(&messages).take_while(|(was, is)| was == is).count();
@@ -231,6 +228,16 @@ impl Copy {
             kept => kept.is_some(),
         };
         Ok(DamageOutcome { refused: false, lost: lost as u64, named, repaired: is_repaired })
+    }
+}
+
+/// The file `name` is refused by this error: its first bytes, or the version in its metadata or in the name of a schema,
+/// are changed.
+fn refused(error: &McapReadError, name: &str) -> Result<DamageOutcome, String> {
+    let is_of_damage = matches!(error, McapReadError::NotMcap { .. } | McapReadError::Version { .. });
+    match is_of_damage && error.to_string().contains(name) {
+        true => Ok(DamageOutcome { refused: true, ..DamageOutcome::default() }),
+        false => Err(format!("{name}: {error}")),
     }
 }
 

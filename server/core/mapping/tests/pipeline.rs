@@ -104,23 +104,6 @@ fn a_step_of_the_host_clock_changes_no_map_of_a_sensor_on_gps_time() {
 }
 
 #[test]
-fn without_poses_no_scan_lacks_the_pose_of_another_clock() {
-    let mut pipeline = pipeline(None);
-    for index in 0..30 {
-        let stepped_ms = if index < 15 { 0 } else { 300 };
-        let event = Event {
-            sequence: index,
-            arrival_ns: index as i64 * 100_000_000,
-            source: 0,
-            body: Body::Scan(scan((index as i64 * 100 + stepped_ms) * 1_000_000)),
-        };
-        pipeline.step(&event).unwrap();
-    }
-    let status = &pipeline.sensors()[0];
-    assert_eq!((status.other_clock.describe(), status.status.revolutions), (None, 30));
-}
-
-#[test]
 fn each_revolution_gives_a_map_and_the_end_gives_a_partial_one() {
     let events = drive();
     let mut pipeline = pipeline(Some(Model::Vlp16));

@@ -117,18 +117,18 @@ fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
     runner.run(&change, |(at, bit)| copy.flip(&original, at, bit).map(drop).map_err(TestCaseError::fail)).unwrap();
     // The heads of some records have few of all bytes, but all of the framing.
     let bytes = in_chunks();
-    // The name of the metadata, a digit of its boot id, and the kind of the record that ends the data: only the
-    // checksum of the whole section covers them.
+    // Only the checksum of the whole section covers the name of the metadata, a digit of its boot id, and the kind of
+    // the record that ends the data. Bit 0 of a digit makes another digit in every boot id.
     let (metadata, data_end) = (records(&bytes, op::METADATA)[0], records(&bytes, op::DATA_END)[0]);
     let digit = bytes.windows(7).position(|text| text == b"boot_id").unwrap() + 7 + 4;
-    // Bit 0 of a digit, so that it becomes another digit in every boot id.
     for (byte, bit) in [(metadata + 15, 0), (digit, 0), (digit + 3, 0)] {
         let outcome = copy.flip(&original, byte, bit).unwrap();
         assert!(outcome.repaired && outcome.lost == 0, "byte {byte}, bit {bit}: {outcome:?}");
     }
-    for bit in 0..8 {
-        copy.flip(&original, data_end, bit).unwrap_or_else(|error| panic!("the end of the data: {error}"));
-    }
+    // The version in the name of a schema: the file is refused as one of a later version.
+    let schema = bytes.windows(15).position(|text| text == b"clearway.v1.Map").unwrap();
+    assert!(copy.flip(&original, schema + 9, 0).unwrap().refused);
+    (0..8).for_each(|bit| drop(copy.flip(&original, data_end, bit).unwrap()));
     let (chunks, indexes) = (records(&bytes, op::CHUNK), records(&bytes, op::MESSAGE_INDEX));
     for at in [chunks[0], chunks[chunks.len() / 2], indexes[indexes.len() / 2]] {
         for (byte, bit) in [(at, 0), (at, 7), (at + 1, 3), (at + 4, 1), (at + 8, 6), (at + 9 + 16, 2)] {

@@ -112,8 +112,7 @@ impl Folder {
     pub fn open(options: &Options) -> io::Result<Self> {
         let mut folder = Self::of(options);
         if folder.file.is_dir() {
-            let allowed = "this is a folder; a file is allowed, such as drive.mcap in it";
-            return Err(io::Error::new(ErrorKind::IsADirectory, allowed));
+            return Err(io::Error::new(ErrorKind::IsADirectory, "a folder; name a file, such as drive.mcap in it"));
         }
         if options.is_numbered {
             folder.file = next_free_name(&folder.file);
@@ -139,15 +138,8 @@ impl Folder {
         let family = if options.family.as_os_str().is_empty() { &options.file } else { &options.family };
         let (file, family) = (options.file.clone(), family.clone());
         let saved_bytes = Some(options.saved_mb << 20).filter(|bytes| *bytes > 0);
-        Self {
-            file,
-            family,
-            replaces: options.replaces,
-            keep_bytes,
-            keep_time,
-            saved_bytes,
-            awaits_store: options.awaits_store,
-        }
+        let (replaces, awaits_store) = (options.replaces, options.awaits_store);
+        Self { file, family, replaces, keep_bytes, keep_time, saved_bytes, awaits_store }
     }
 
     fn parent(&self) -> &Path {

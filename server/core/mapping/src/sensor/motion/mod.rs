@@ -377,3 +377,17 @@ fn extrapolate(pose: &EgoPose, other: Option<&EgoPose>, stamp_ns: i64) -> Isomet
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn without_poses_no_clock_of_poses_differs_from_the_clock_of_the_scan() {
+        let mut motion = Motion::new(&MotionConfig::default());
+        motion.note_scan(0, 0, 300_000_000);
+        assert_eq!(motion.ahead_of_scan_ns(), None);
+        motion.push_pose(&EgoPose { stamp_ns: 0, map_from_ego: Isometry3::identity(), speed_mps: 0.0 }, 0);
+        assert_eq!(motion.ahead_of_scan_ns(), Some(-300_000_000));
+    }
+}
