@@ -128,7 +128,7 @@ fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
     // The version in the name of a schema: the file is refused as one of a later version.
     let schema = bytes.windows(15).position(|text| text == b"clearway.v1.Map").unwrap();
     assert!(copy.flip(&original, schema + 9, 0).unwrap().refused);
-    (0..8).for_each(|bit| drop(copy.flip(&original, data_end, bit).unwrap()));
+    (0..8).for_each(|bit| _ = copy.flip(&original, data_end, bit).unwrap());
     let (chunks, indexes) = (records(&bytes, op::CHUNK), records(&bytes, op::MESSAGE_INDEX));
     for at in [chunks[0], chunks[chunks.len() / 2], indexes[indexes.len() / 2]] {
         for (byte, bit) in [(at, 0), (at, 7), (at + 1, 3), (at + 4, 1), (at + 8, 6), (at + 9 + 16, 2)] {
