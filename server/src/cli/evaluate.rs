@@ -63,7 +63,7 @@ pub struct EvaluateArguments {
     /// at 7, 10, 15 and 20 m) and count their cells that are called free.
     #[arg(long)]
     objects: bool,
-    /// Write each scan and its truth to this folder, for other programs, but not those of sim:NAME other than
+    /// Write each scan and its truth to this folder, for other programs, but no scan of sim:NAME other than
     /// sim:random; files that exist are not replaced.
     #[arg(long, value_name = "DIR")]
     write_scans: Option<PathBuf>,

@@ -29,7 +29,7 @@ use clearway_daemon::base::files;
 pub struct ExportArguments {
     /// The recording (MCAP); a file that is cut off is exported as far as it goes.
     recording: PathBuf,
-    /// Layers, such as freespace, separated by commas; all if absent. `clearway info` lists those of a recording.
+    /// Layers, such as freespace, separated by commas; all if absent. `clearway info` lists the layers.
     #[arg(long = "layer", alias = "layers", value_name = "LAYER", value_delimiter = ',')]
     layers: Vec<String>,
     /// Format of the files.

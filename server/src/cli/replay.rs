@@ -45,7 +45,7 @@ pub struct ReplayArguments {
     /// Speed of the replay: as-recorded, max, or a factor such as 0.5 [default: max; as-recorded with --serve].
     #[arg(long, value_name = "as-recorded|max|X")]
     speed: Option<ReplaySpeed>,
-    /// Begin this many seconds after the first event; the maps from there are those of the whole drive.
+    /// Begin this many seconds after the first event; the maps from there are the maps of the whole drive.
     #[arg(long, value_name = "SECONDS", value_parser = offset)]
     from: Option<f64>,
     /// End this many seconds after the first event.
@@ -78,7 +78,7 @@ pub struct ReplayArguments {
     #[arg(long = "fault", value_name = "FAULT", value_parser = |text: &str| text.parse::<Fault>())]
     faults: Vec<Fault>,
     /// Publish the maps, and the last one until SIGINT (Ctrl-C) or SIGTERM. Without --as-live the maps keep the stamps
-    /// of the recording, so readers see those of an old recording as stale.
+    /// of the recording, so readers see the maps of an old recording as stale.
     #[arg(long)]
     serve: bool,
     #[command(flatten)]

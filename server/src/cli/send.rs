@@ -29,7 +29,7 @@ pub struct SendArguments {
     /// Target of the data packets.
     #[arg(long, value_name = "udp://HOST:PORT")]
     to: String,
-    /// Target of the telemetry; that of the data packets if absent.
+    /// Target of the telemetry; the target of the data packets if absent.
     #[arg(long, value_name = "udp://HOST:PORT")]
     telemetry_to: Option<String>,
     /// Address to send from, with or without a port; a server tells sensors apart by it.

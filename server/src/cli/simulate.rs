@@ -51,7 +51,7 @@ pub struct SimulateArguments {
     /// Send the datagrams to this address as they are made, in real time.
     #[arg(long, value_name = "udp://HOST:PORT")]
     to: Option<String>,
-    /// With --to: the target of the telemetry; that of the data packets if absent.
+    /// With --to: the target of the telemetry; the target of the data packets if absent.
     #[arg(long, value_name = "udp://HOST:PORT", requires = "to", conflicts_with = "out")]
     telemetry_to: Option<String>,
 }

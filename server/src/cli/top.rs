@@ -12,7 +12,7 @@ use crate::vehicles::table::{table, with_others};
 
 /// Show the vehicles of a fleet live: state, age, rate, loss, latency, readers, and what is wrong.
 ///
-/// The vehicles are those of the server and of the servers it knows, which announce theirs once a second.
+/// It lists the vehicles of the server and of the servers it knows, which announce theirs once a second.
 /// The table is renewed once a second and whenever a state changes, the worst vehicle first; Ctrl-C ends it. If stdout
 /// is not a terminal, each table follows the one before.
 #[derive(Args)]

@@ -45,7 +45,7 @@ enum TransportRequest {
         #[arg(default_value = "1", value_parser = clap::value_parser!(u32).range(1..=i64::from(STEP_MAX)))]
         maps: u32,
     },
-    /// Jump to this time. A paused replay stays paused there; one that has ended plays on.
+    /// Jump to this time. A paused replay stays paused there; a replay that has ended plays on.
     Seek {
         /// Seconds after the first event, from 0 on.
         #[arg(allow_negative_numbers = true, value_parser = offset)]

@@ -15,7 +15,7 @@ use clearway_daemon::base::files;
 
 /// Compute every map of recordings again from their events, and name the first differences.
 ///
-/// Or compare their maps with those of another configuration or recording.
+/// Or compare their maps with the maps of another configuration or recording.
 #[derive(Args)]
 #[command(
     after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
@@ -54,13 +54,13 @@ pub struct VerifyArguments {
 #[derive(Args)]
 #[command(next_help_heading = "Compare a change")]
 struct ChangeArguments {
-    /// Compare the recorded maps with those that this configuration makes of the recorded events.
+    /// Compare the recorded maps with the maps that this configuration makes of the recorded events.
     #[arg(long, value_name = "NEW.toml", conflicts_with = "against")]
     config: Option<PathBuf>,
     /// Override a key of that configuration, or of the recorded one; may be given several times.
     #[arg(long, value_name = "KEY=VALUE", conflicts_with = "against")]
     set: Vec<String>,
-    /// Compare the maps with those of this recording of the same drive.
+    /// Compare the maps with the maps of this recording of the same drive.
     #[arg(long, value_name = "OTHER.mcap")]
     against: Option<PathBuf>,
 }

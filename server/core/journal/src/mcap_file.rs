@@ -184,15 +184,7 @@ impl<D: Disk> McapFile<D> {
             // reader cannot distinguish from damage.
             .disable_seeking(true)
             .create(NoSeek::new(BufWriter::new(disk.clone())))?;
-        let names: Vec<&str> = header.vehicles.iter().map(|(name, _)| &**name).collect();
-        let mut metadata = header.metadata.clone();
-        metadata.insert("format".into(), FORMAT.to_string());
-        metadata.insert("boot_id".into(), header.boot_id.to_string());
-        metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
-        metadata.insert("vehicles".into(), names.join(","));
-        metadata.insert("part".into(), part.to_string());
-        metadata.insert("maps".into(), recorded.as_str().into());
-        writer.write_metadata(&Metadata { name: "clearway".into(), metadata })?;
+        writer.write_metadata(&metadata(header, recorded, part))?;
         let mut attach = |name: String, media_type: &str, text: &str| {
             let data = text.as_bytes().into();
             writer.attach(&Attachment { log_time: 0, create_time: 0, name, media_type: media_type.into(), data })
@@ -294,4 +286,17 @@ impl<D: Disk> McapFile<D> {
     pub fn abandon(self) {
         self.disk.locked().failed.get_or_insert(io::ErrorKind::Other);
     }
+}
+
+/// The metadata of part number `part` of a recording.
+fn metadata(header: &RecordingHeader, recorded: RecordedMaps, part: u64) -> Metadata {
+    let names: Vec<&str> = header.vehicles.iter().map(|(name, _)| &**name).collect();
+    let mut metadata = header.metadata.clone();
+    metadata.insert("format".into(), FORMAT.to_string());
+    metadata.insert("boot_id".into(), header.boot_id.to_string());
+    metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
+    metadata.insert("vehicles".into(), names.join(","));
+    metadata.insert("part".into(), part.to_string());
+    metadata.insert("maps".into(), recorded.as_str().into());
+    Metadata { name: "clearway".into(), metadata }
 }

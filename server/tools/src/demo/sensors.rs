@@ -1,4 +1,4 @@
-//! The sensors of the simulated car, and which of them this machine can simulate in real time.
+//! The sensors of the simulated car, and the ones that this machine can simulate in real time.
 //!
 //! In: the choice on the command line. Out: the sensor on the roof, and why it was chosen.
 

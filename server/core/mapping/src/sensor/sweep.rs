@@ -237,7 +237,7 @@ impl Sweep {
 
     /// True if [`Sweep::set_scan`] keeps a point at this position, sensor frame, metres.
     pub fn keeps(mount: &Mount, [x, y, z]: [f32; 3]) -> bool {
-        classify(x, y, z).1 & is_far(mount.range_m_min, x, y, z)
+        classify(x, y, z).1 & is_far(mount.range_m_min, [x, y, z])
     }
 
     fn prepare(&mut self, calibration: Option<&Arc<Calibration>>, mount: &Mount) {

@@ -124,7 +124,7 @@ impl WideLoop for MoveAtRest<'_> {
         // Without a branch, so that the compiler vectorises it.
         for i in 0..n {
             let (is_position, is_return) = classify(xs[i], ys[i], zs[i]);
-            moved.are_kept[i] = is_return & is_far(range_m_min, xs[i], ys[i], zs[i]);
+            moved.are_kept[i] = is_return & is_far(range_m_min, [xs[i], ys[i], zs[i]]);
             (positions, returns) = (positions + u32::from(is_position), returns + u32::from(is_return));
             [moved.x[i], moved.y[i], moved.z[i]] = transform.apply(xs[i], ys[i], zs[i]);
         }
@@ -143,7 +143,7 @@ pub(crate) fn classify(x: f32, y: f32, z: f32) -> (bool, bool) {
 
 /// True if a position, sensor frame, metres, is at least `range_m_min` away from the sensor.
 #[inline(always)]
-pub(crate) fn is_far(range_m_min: f32, x: f32, y: f32, z: f32) -> bool {
+pub(crate) fn is_far(range_m_min: f32, [x, y, z]: [f32; 3]) -> bool {
     squared_range(x, y, z) >= range_m_min * range_m_min
 }
 

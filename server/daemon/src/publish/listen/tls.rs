@@ -31,7 +31,7 @@ impl Tls {
     /// The TLS with these certificates.
     ///
     /// # Errors
-    /// A text that says which of them is invalid.
+    /// A text that names the invalid part: certificate, key or CA.
     pub fn new(certificates: &Certificates) -> Result<Self, String> {
         let Certificates { certificate, key, client_ca, .. } = certificates;
         let chain = parse_chain("certificate", certificate)?;

@@ -1,4 +1,4 @@
-//! The names of the files of a recording, and which of them are deleted.
+//! The names of the files of a recording, and the files that are deleted.
 
 use super::*;
 
