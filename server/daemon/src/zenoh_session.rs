@@ -99,8 +99,8 @@ pub fn settings<'a>(
 /// [`ZenohError`] if an endpoint is not available, or if it is the client of a router and none answers.
 pub(crate) async fn open(config: Config, options: &Options) -> Result<Session, ZenohError> {
     let endpoints = match options.mode {
-        ZenohMode::Client => format!("connect {}", options.connect.join(", ")),
-        ZenohMode::Peer | ZenohMode::Router => format!("listen {}", options.listen.join(", ")),
+        ZenohMode::Client => format!("zenoh.connect = {}", options.connect.join(", ")),
+        ZenohMode::Peer | ZenohMode::Router => format!("zenoh.listen = {}", options.listen.join(", ")),
     };
     zenoh::open(config).await.map_err(ZenohError::of(format!("open ({endpoints})")))
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use clearway_daemon::config::{Config, ConfigError, Origin, of_environment};
+use clearway_daemon::config::{Config, ConfigError, of_environment};
 
 /// The options that name a configuration file and override its keys.
 #[derive(Args)]
@@ -31,8 +31,9 @@ impl ConfigurationOptions {
     /// # Errors
     /// [`ConfigError`].
     pub fn load(&self) -> Result<Config, ConfigError> {
-        let config = Config::load_vehicles(&self.config, &self.overrides(), &self.vehicles)?;
-        config.check_exposure(&Origin::file(&self.config))?;
+        let overrides = self.overrides();
+        let config = Config::load_vehicles(&self.config, &overrides, &self.vehicles)?;
+        config.check_exposure(&self.config, &overrides)?;
         Ok(config)
     }
 

@@ -5,7 +5,7 @@ use clap::Args;
 use clearway_client::v1;
 
 use crate::connect::{ServerOptions, explain};
-use crate::terminal::{Exit, age_text, print_line};
+use crate::terminal::{Exit, age_text, one_line, print_line};
 use clearway_daemon::status::{State, vehicle_json};
 
 /// Print the state of each vehicle: ok, or what is wrong with it.
@@ -42,7 +42,7 @@ pub async fn run(options: &StatusArguments) -> Result<Exit> {
         print_line(&serde_json::to_string_pretty(&documents)?)?;
     } else {
         for line in selected.iter().flat_map(|vehicle| lines(vehicle)) {
-            print_line(&line)?;
+            print_line(&one_line(&line))?;
         }
     }
     Ok(exit(selected.iter().map(|vehicle| vehicle.state.as_str())))

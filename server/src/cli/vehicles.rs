@@ -6,7 +6,7 @@ use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
 use crate::connect::{ServerOptions, explain};
-use crate::terminal::{Exit, age_text, counted, print_line};
+use crate::terminal::{Exit, age_text, counted, one_line, print_line};
 use crate::vehicles::servers::{is_of_several_servers, server_text};
 use clearway_daemon::status::vehicle_json;
 
@@ -34,7 +34,7 @@ pub async fn run(options: &VehiclesArguments) -> Result<Exit> {
     }
     let is_fleet = is_of_several_servers(&vehicles);
     for line in vehicles.iter().flat_map(|vehicle| lines(vehicle, is_fleet, now)) {
-        print_line(&line)?;
+        print_line(&one_line(&line))?;
     }
     if vehicles.is_empty() {
         print_line("the server has no vehicles")?;

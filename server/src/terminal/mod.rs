@@ -8,7 +8,7 @@ mod screen;
 mod usage;
 
 pub use exit::{EXIT_CODES, Exit};
-pub use output::{age_text, counted, print, print_line, printable, with_causes};
+pub use output::{age_text, counted, one_line, print, print_line, printable, with_causes};
 pub use progress::draw_progress;
 #[cfg(feature = "tools")]
 pub use progress::progress_bar;

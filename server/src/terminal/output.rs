@@ -27,6 +27,13 @@ pub fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() && !matches!(c, '\n' | '\t') { '\u{fffd}' } else { c }).collect()
 }
 
+/// The text on one line, which it cannot leave or turn round: a space for each control character of terminals and of
+/// the direction of text. A server may have passed it on from another one.
+pub fn one_line(text: &str) -> String {
+    let commands = |c: char| c.is_control() || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    text.chars().map(|c| if commands(c) { ' ' } else { c }).collect()
+}
+
 /// Prints `text` on stdout, as [`printable`] has it. `false` if the reader of stdout has closed it (`| head`), which is
 /// no error.
 ///
@@ -52,6 +59,11 @@ pub fn print_line(line: &str) -> Result<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_text_of_another_server_makes_no_line_of_its_own() {
+        assert_eq!(one_line("top\n\u{1b}[31mcar: OK\u{202e}"), "top  [31mcar: OK ");
+    }
 
     #[test]
     fn an_error_names_each_cause_once() {

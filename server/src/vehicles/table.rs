@@ -23,7 +23,7 @@ pub fn table(mut vehicles: Vec<v1::Vehicle>, columns: usize, is_coloured: bool) 
     let is_fleet = is_of_several_servers(&vehicles);
     let severity = |state: &str| ["error", "warn", "ok"].iter().position(|known| *known == state).unwrap_or(1);
     vehicles.sort_by_cached_key(|of| (severity(&of.state), of.name.clone(), server_text(of)));
-    let servers: Vec<_> = vehicles.iter().map(|of| printable(&server_text(of))).collect();
+    let servers: Vec<_> = vehicles.iter().map(|of| one_line(&server_text(of))).collect();
     let wide = servers.iter().map(|text| measure_text_width(text)).max().unwrap_or(0).min(SERVER_COLUMNS_MAX);
     let column = |text: &str| match is_fleet {
         true => pad_str(&truncate_str(text, wide, "…"), wide, Alignment::Left, None).into_owned() + " ",
@@ -63,7 +63,7 @@ pub fn table(mut vehicles: Vec<v1::Vehicle>, columns: usize, is_coloured: bool) 
             (true, _) => Style::new().force_styling(true).green(),
         };
         lines.push(style.apply_to(cut(row(vehicle, &column(server)))).to_string());
-        lines.extend(vehicle.reasons.iter().map(|reason| cut(format!("    {}", printable(reason)))));
+        lines.extend(vehicle.reasons.iter().map(|reason| cut(format!("    {}", one_line(reason)))));
     }
     lines
 }
@@ -78,8 +78,8 @@ fn row(vehicle: &v1::Vehicle, server: &str) -> String {
     let (readers, skips): (u32, u64) = (vehicle.readers.values().sum(), vehicle.skips.values().sum());
     format!(
         "{:<16} {server}{:<5} {age:>8} {:>6.1} {:>6} {latency:>7} {:>8.1} {share:>6} {readers:>7} {skips:>6} {speed:>7}",
-        truncate_str(&printable(&vehicle.name), 16, "…"),
-        printable(&vehicle.state).to_uppercase(),
+        truncate_str(&one_line(&vehicle.name), 16, "…"),
+        one_line(&vehicle.state).to_uppercase(),
         vehicle.map_rate_hz,
         or_dash(vehicle.loss.map(|loss| format!("{:.1} %", 100.0 * loss))),
         vehicle.map_bytes / 1e3,
@@ -96,8 +96,8 @@ fn age(ms: f64) -> String {
 }
 
 /// The text on one line.
-fn printable(text: &str) -> String {
-    terminal::printable(text).replace(['\n', '\t'], "\u{fffd}")
+fn one_line(text: &str) -> String {
+    terminal::one_line(text).replace(['\n', '\t'], "\u{fffd}")
 }
 
 #[cfg(test)]

@@ -108,8 +108,14 @@ fn a_bag_in_sqlite_is_read_like_the_mcap_file_of_its_messages() {
     };
     assert!(messages(&bag) == messages(&mcap));
     assert!(readings(&bag) == readings(&mcap));
-    // `repair` therefore converts a bag.
     let folder = tempfile::tempdir().unwrap();
+    let unsorted = folder.path().join("unsorted.db3");
+    std::fs::copy(&bag, &unsorted).unwrap();
+    let sqlite = Connection::open(&unsorted).unwrap();
+    sqlite.execute_batch("DROP INDEX timestamp_idx; UPDATE messages SET id = -id").unwrap();
+    drop(sqlite);
+    assert!(messages(&unsorted) == messages(&mcap), "without an index of the times, in another order");
+    // `repair` therefore converts a bag.
     let converted = folder.path().join("converted.mcap");
     assert_eq!(repair(&bag, &converted).unwrap().messages, 4);
     assert!(messages(&converted) == messages(&mcap));
@@ -201,11 +207,12 @@ fn a_bag_that_computes_what_it_holds_is_refused_by_name() {
         ),
         (
             format!(
-                "{table}); WITH RECURSIVE n (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 10001)
+                "{table}); WITH RECURSIVE n (i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 250001)
                 INSERT INTO messages SELECT i, 1, i, NULL FROM n"
             ),
             "no index of their times",
         ),
+        (format!("{table}); UPDATE topics SET name = hex(zeroblob(600))"), "a name of 1200 bytes, of at most 1024"),
     ] {
         let file = tempfile::NamedTempFile::new().unwrap();
         Connection::open(file.path()).unwrap().execute_batch(&format!("{topics} {messages}")).unwrap();

@@ -18,15 +18,20 @@ use crate::counted::counted;
 
 /// Number of messages that are read at once. Ours: a message of points has about a megabyte.
 const BATCH: i64 = 1024;
-/// Number of messages that are read at once without an index of the times: SQLite keeps them all while it sorts.
-const BATCH_UNSORTED: i64 = 16;
-/// Most messages of a bag without an index of the times, which is read whole for each batch. Ours: rosbag2 and every
-/// library that writes bags makes the index.
-const UNSORTED_MAX: i64 = 10_000;
+/// The messages after a time and an id.
+const BY_TIME: &str = "SELECT id, topic_id, timestamp, data FROM messages WHERE (timestamp, id) > (?1, ?2) \
+    ORDER BY timestamp, id LIMIT ?3";
+/// The message of a row.
+const BY_ROW: &str = "SELECT id, topic_id, timestamp, data FROM messages WHERE rowid = ?1";
+/// Most messages of a bag without an index of the times: their order is kept in memory, 8 bytes for each. Ours: rosbag2
+/// and every library that writes bags makes the index.
+const UNSORTED_MAX: usize = 250_000;
+/// Longest name of a topic, a type or an encoding, in bytes. Ours: names of ROS 2 are shorter.
+const NAME_BYTES_MAX: usize = 1024;
 /// Number of bytes of messages after which no more are read at once.
 const BATCH_BYTES: usize = 16 << 20;
 /// Most steps of a query in SQLite's machine. Ours: with an index of the times a batch takes 30 for each message of the
-/// batch; without it, 10 for each message of the bag.
+/// batch; without it, the order takes some 50 for each message of the bag.
 const QUERY_STEPS_MAX: i32 = 1_000_000_000;
 /// The first of the two tables that is a view, of a module, or has columns that are computed when they are read.
 const NOT_PLAIN: &str = "SELECT name FROM pragma_table_list AS listed WHERE lower(name) IN ('topics', 'messages') AND \
@@ -43,8 +48,8 @@ pub(super) struct BagRecords {
     /// Holds the copy that is read; removed after the connection.
     _copy: Option<TempDir>,
     waiting: VecDeque<Record<'static>>,
-    /// Number of messages that are read at once.
-    batch: i64,
+    /// Rows of the messages in the order of their times, if no index has it.
+    order: Option<std::vec::IntoIter<i64>>,
     /// Time and id of the newest message.
     newest: (i64, i64),
     bytes_read: u64,
@@ -81,18 +86,15 @@ impl BagRecords {
             return Err(refused(format!("{name:?} is no plain table")));
         }
         let is_unsorted: bool = bag.query_row(NOT_SORTED, [], |row| row.get(0))?;
-        let greatest =
-            || bag.query_row("SELECT max(rowid) FROM messages", [], |row| row.get::<_, Option<i64>>(0)).ok()?;
-        if is_unsorted && greatest().is_some_and(|greatest| greatest > UNSORTED_MAX) {
-            let advice = "sqlite3 BAG 'CREATE INDEX timestamp_idx ON messages (timestamp)' makes it, as rosbag2 does";
-            let what = "its messages have no index of their times";
-            return Err(refused(format!("{what}, and it has more than {UNSORTED_MAX} messages: {advice}")));
-        }
         let mut waiting = VecDeque::new();
         let mut topics = bag.prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")?;
         let mut rows = topics.query([])?;
         while let Some(row) = rows.next()? {
-            let (id, topic, name, encoding): (_, _, _, String) = (row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?);
+            let (id, topic, name, encoding): (_, String, String, String) =
+                (row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?);
+            if let Some(long) = [&topic, &name, &encoding].into_iter().find(|text| text.len() > NAME_BYTES_MAX) {
+                return Err(refused(format!("a name of {} bytes, of at most {NAME_BYTES_MAX}", long.len())));
+            }
             // Some recorders leave out the name of the only encoding that ROS 2 has.
             let message_encoding = if encoding.is_empty() { "cdr".to_owned() } else { encoding };
             // A bag has no definitions of its types; an empty encoding says so.
@@ -103,14 +105,14 @@ impl BagRecords {
         }
         drop(rows);
         drop(topics);
+        let order = if is_unsorted { Some(rows_by_time(&bag)?.into_iter()) } else { None };
         let newest = (i64::MIN, i64::MIN);
-        let batch = if is_unsorted { BATCH_UNSORTED } else { BATCH };
         let (bytes_read, decompressed) = (0, 0);
         Ok(Self {
             bag,
             _copy: copy,
             waiting,
-            batch,
+            order,
             newest,
             bytes_read,
             decompressed,
@@ -160,11 +162,12 @@ impl BagRecords {
     }
 
     fn read_batch(&mut self) -> rusqlite::Result<()> {
-        let mut messages = self.bag.prepare(
-            "SELECT id, topic_id, timestamp, data FROM messages WHERE (timestamp, id) > (?1, ?2) \
-             ORDER BY timestamp, id LIMIT ?3",
-        )?;
-        let mut rows = messages.query(params![self.newest.0, self.newest.1, self.batch])?;
+        let mut messages = self.bag.prepare(if self.order.is_some() { BY_ROW } else { BY_TIME })?;
+        let mut rows = match &mut self.order {
+            // After the last row there is none.
+            Some(order) => messages.query([order.next()])?,
+            None => messages.query(params![self.newest.0, self.newest.1, BATCH])?,
+        };
         self.has_ended = true;
         let mut bytes = 0;
         while bytes < BATCH_BYTES
@@ -187,6 +190,21 @@ impl BagRecords {
         }
         Ok(())
     }
+}
+
+/// The rows of all messages in the order of their times.
+///
+/// # Errors
+/// If there are more than [`UNSORTED_MAX`], or the table cannot be read.
+fn rows_by_time(bag: &Connection) -> rusqlite::Result<Vec<i64>> {
+    let mut rows = bag.prepare("SELECT rowid FROM messages ORDER BY timestamp, id LIMIT ?1")?;
+    let rows: Vec<_> = rows.query_map([UNSORTED_MAX as i64 + 1], |row| row.get(0))?.collect::<Result<_, _>>()?;
+    if rows.len() > UNSORTED_MAX {
+        let advice = "sqlite3 BAG 'CREATE INDEX timestamp_idx ON messages (timestamp)' makes it, as rosbag2 does";
+        let what = "its messages have no index of their times";
+        return Err(refused(format!("{what}, and it has more than {UNSORTED_MAX} messages: {advice}")));
+    }
+    Ok(rows)
 }
 
 /// The bag to open, the folder of the copy if it is one, and true if no program writes it and SQLite need not look.

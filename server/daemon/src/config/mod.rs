@@ -264,9 +264,14 @@ impl Config {
     /// a server that starts: the configuration of a recording is not served.
     ///
     /// # Errors
-    /// [`ConfigError::Value`] for the first address that other hosts can reach without TLS, or from any sender.
-    pub fn check_exposure(&self, origin: &Origin) -> Result<(), ConfigError> {
-        self.check_exposed_values().map_err(|error| error.at(origin))
+    /// [`ConfigError::Value`] for the first address that other hosts can reach without TLS, or from any sender: of the
+    /// override that gave it, else of the file.
+    pub fn check_exposure(&self, file: &Path, overrides: &[String]) -> Result<(), ConfigError> {
+        self.check_exposed_values().map_err(|error| {
+            let is_overridden = matching(overrides, &error.key).next().is_some();
+            let options = Origin::Options(blamed(overrides, &error.key));
+            error.at(&if is_overridden { options } else { Origin::file(file) })
+        })
     }
 
     /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground,

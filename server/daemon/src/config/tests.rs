@@ -351,7 +351,7 @@ fn names_that_ros_2_does_not_allow_are_refused_if_ros2_is_enabled() {
 fn an_address_that_other_hosts_can_reach_needs_protection_or_its_name_in_words() {
     let exposed = |text: &str| {
         let config = Config::parse(NEEDED, Path::new("a.toml"), &[text.to_owned()]).unwrap();
-        config.check_exposure(&Origin::file(Path::new("a.toml"))).err().map(|error| error.to_string())
+        config.check_exposure(Path::new("a.toml"), &[text.to_owned()]).err().map(|error| error.to_string())
     };
     assert_eq!(exposed("grpc.enabled=true"), None, "the defaults");
     for (setting, service) in [
@@ -366,9 +366,10 @@ fn an_address_that_other_hosts_can_reach_needs_protection_or_its_name_in_words()
     ] {
         let refused = exposed(setting).unwrap_or_else(|| panic!("{setting} is accepted"));
         assert!(refused.contains(&format!("connections.unprotected = [\"{service}\"]")), "{refused}");
+        assert!(refused.contains(setting) && !refused.contains("a.toml"), "it names the option: {refused}");
         let options = [setting.to_owned(), format!("connections.unprotected=[\"{service}\"]")];
         let config = Config::parse(NEEDED, Path::new("a.toml"), &options).unwrap();
-        config.check_exposure(&Origin::file(Path::new("a.toml"))).unwrap();
+        config.check_exposure(Path::new("a.toml"), &[]).unwrap();
     }
     for allowed in [
         "zenoh.listen=[\"tcp/localhost:7447\", \"tcp/[::1]:7447\", \"tcp/127.0.0.1:7447\"]",

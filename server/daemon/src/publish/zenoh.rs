@@ -24,7 +24,6 @@ use std::time::{Duration, Instant};
 
 use clearway_client::signature::SigningKey;
 use futures::future::{Fuse, FusedFuture, FutureExt};
-use serde_json::Value;
 use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::bytes::{Encoding, ZBytes};
@@ -153,7 +152,6 @@ impl Publisher {
         let link = self.awaits_router.then(|| (self.session.clone(), format!("clearway/{vehicle}/link")));
         let pace = Pace { link, period: self.period };
         self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay, pace));
-        self.watch_claims(served).await?;
         self.tasks.spawn({
             let served = served.clone();
             async move {
@@ -184,22 +182,6 @@ impl Publisher {
                 if let Err(error) = reply.await {
                     tracing::debug!(%error, "zenoh: reply");
                 }
-            }
-        });
-        Ok(())
-    }
-
-    /// Notes the servers that publish the status of a vehicle of the same name.
-    async fn watch_claims(&mut self, served: &Served) -> Result<(), ZenohError> {
-        let key = format!("clearway/{}/status", served.status.name);
-        let subscriber = self.session.declare_subscriber(key.clone()).allowed_origin(Locality::Remote);
-        let claims = subscriber.await.map_err(ZenohError::of(format!("subscriber {key}")))?;
-        let status = served.status.clone();
-        self.tasks.spawn(async move {
-            while let Ok(sample) = claims.recv_async().await {
-                let Ok(document) = serde_json::from_slice::<Value>(&sample.payload().to_bytes()) else { continue };
-                let boot_id = document["boot_id"].as_str().unwrap_or_default();
-                status.note_claim(boot_id, document["server"].as_str().unwrap_or("of unknown name"));
             }
         });
         Ok(())

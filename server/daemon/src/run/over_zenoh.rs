@@ -44,6 +44,8 @@ pub(super) struct OverZenoh {
     ros: Vec<LiveTopics>,
     /// One task a vehicle.
     announcements: JoinSet<()>,
+    /// The keys of the announcements.
+    announced: Vec<String>,
     /// One task a vehicle.
     recorder: JoinSet<()>,
     _fleet: Option<Subscriber<()>>,
@@ -59,13 +61,14 @@ impl OverZenoh {
     pub(super) async fn start(session: Session, users: &Users) -> Result<Self, ZenohError> {
         let Users { config, vehicles, gateways, queues, fleet, grpc, recorder: control } = users;
         let publisher = Publisher::start(&session, &config.zenoh, vehicles).await?;
-        let mut announcements = JoinSet::new();
+        let (mut announcements, mut announced) = (JoinSet::new(), Vec::new());
         if config.zenoh.fleet.announce {
             let address = grpc.and_then(|bound| config.grpc.advertised(bound)).unwrap_or_default();
-            announcements::announce(&session, vehicles, (&address, &config.page.advertise), &mut announcements).await?;
+            let of_grpc_and_page = (&*address, &*config.page.advertise);
+            announced = announcements::announce(&session, vehicles, of_grpc_and_page, &mut announcements).await?;
         }
         let others = match config.zenoh.fleet.list {
-            true => Some(announcements::hear(&session, fleet.clone()).await?),
+            true => Some(announcements::hear(&session, fleet.clone(), vehicles.clone()).await?),
             false => None,
         };
         let (mut ingest, mut ros, mut recorder) = (JoinSet::new(), Vec::new(), JoinSet::new());
@@ -83,7 +86,7 @@ impl OverZenoh {
             let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
             ros.push(live::subscribe(&session, topics, &vehicle.name, sensors, queue.clone()).await?);
         }
-        Ok(Self { session, publisher, ingest, ros, announcements, recorder, _fleet: others })
+        Ok(Self { session, publisher, ingest, ros, announcements, announced, recorder, _fleet: others })
     }
 
     /// True if the session is connected to a router.
@@ -106,6 +109,7 @@ impl OverZenoh {
     /// Ends publishing and ingest, and closes the session.
     pub(super) async fn stop(mut self) {
         self.announcements.shutdown().await;
+        announcements::take_back(&self.session, &self.announced).await;
         self.ingest.shutdown().await;
         self.recorder.shutdown().await;
         self.publisher.stop().await;

@@ -252,14 +252,13 @@ mod tests {
     #[test]
     fn another_server_that_claims_the_vehicle_is_named_and_a_flood_of_claims_is_bounded() {
         let status = VehicleStatus::new("car".into(), 7, vec![], Arc::default());
-        status.note_claim("7", "itself");
-        status.note_claim("no number", "liar");
+        status.note_claim(7, "itself");
         assert_eq!(status.assess().claimed_by, Vec::<String>::new());
-        status.note_claim("8", "b\u{1b}[2J");
+        status.note_claim(8, "b\u{1b}[2J");
         assert_eq!(status.assess().claimed_by, ["b[2J"]);
-        status.note_claim("1311768467463790320", "b\u{1b}[2J");
+        status.note_claim(1_311_768_467_463_790_320, "b\u{1b}[2J");
         assert_eq!(status.assess().claimed_by, ["b[2J (run 00000000)", "b[2J (run 12345678)"], "two of one name");
-        (100..200).for_each(|boot_id: u64| status.note_claim(&boot_id.to_string(), &format!("{boot_id:>99}")));
+        (100..200).for_each(|boot_id: u64| status.note_claim(boot_id, &format!("{boot_id:>99}")));
         let claimed_by = status.assess().claimed_by;
         assert!(
             claimed_by.len() <= CLAIMS_MAX

@@ -239,8 +239,7 @@ impl VehicleStatus {
 
     /// Notes a sign of life of another server that serves a vehicle of this name, by the boot id of its run. Anyone may
     /// have sent it: of a few runs, a short printable name is kept.
-    pub fn note_claim(&self, boot_id: &str, server: &str) {
-        let Ok(id) = boot_id.parse::<u64>() else { return };
+    pub fn note_claim(&self, id: u64, server: &str) {
         let mut claims = locked(&self.claims);
         if id != self.boot_id && (claims.len() < CLAIMS_MAX || claims.contains_key(&id)) {
             let name = server.chars().filter(|c| !c.is_control()).take(SERVER_NAME_MAX).collect();

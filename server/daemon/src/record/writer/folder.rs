@@ -26,7 +26,7 @@ const STILL_WRITTEN: Duration = Duration::from_secs(60);
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
     /// The file or the recorder's thread cannot be created.
-    #[error("recording {}: {source}", file.display())]
+    #[error("recorder.file = {}: {source}", file.display())]
     Create {
         /// Path of the recording.
         file: PathBuf,
