@@ -231,8 +231,8 @@ impl Copy {
     }
 }
 
-/// The file `name` is refused by this error: its first bytes, or the version in its metadata or in the name of a schema,
-/// are changed.
+/// The file `name` is refused by this error: its first bytes, or the version in its metadata or in the name of a
+/// schema, are changed.
 fn refused(error: &McapReadError, name: &str) -> Result<DamageOutcome, String> {
     let is_of_damage = matches!(error, McapReadError::NotMcap { .. } | McapReadError::Version { .. });
     match is_of_damage && error.to_string().contains(name) {

@@ -30,8 +30,8 @@ const LISTED_MAX: Duration = Duration::from_secs(30);
 /// Most memory of the vehicles of other servers, in bytes, by [`decoded_bytes`]. Ours: a thousand vehicles with one
 /// sensor, some hundred with eight.
 const BYTES_MAX: usize = 8 << 20;
-/// Longest list of the vehicles of other servers, in bytes of their announcements. A client of gRPC reads a message of 4
-/// MiB, and the vehicles of this server are in the list too.
+/// Longest list of the vehicles of other servers, in bytes of their announcements. A client of gRPC reads a message of
+/// 4 MiB, and the vehicles of this server are in the list too.
 const LIST_BYTES_MAX: usize = 3 << 20;
 /// Most reasons of a vehicle of another server that are shown. Ours: a server gives fewer.
 const REASONS_MAX: usize = 32;
@@ -189,8 +189,8 @@ impl Fleet {
         locked(&self.0).vehicles.remove(&(vehicle.to_owned(), boot_id));
     }
 
-    /// A vehicle of another server by its name at the time `now`; `None` if its server is silent. If several servers claim it, the newest map of the
-    /// servers that announce an address decides.
+    /// A vehicle of another server by its name at the time `now`; `None` if its server is silent. If several servers
+    /// claim it, the newest map of the servers that announce an address decides.
     pub fn find(&self, name: &str, now: Instant) -> Option<v1::Vehicle> {
         let heard = self.heard(now);
         let of_name = heard.vehicles.values().filter(|of| of.vehicle.name == name && !of.is_silent(now));
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_whose_server_is_silent_is_in_error_and_leads_nobody_until_it_is_forgotten() {
+    fn a_vehicle_whose_server_is_silent_is_in_error_and_leads_no_reader_until_it_is_forgotten() {
         let (fleet, start) = (Fleet::default(), Instant::now());
         let vehicle = v1::Vehicle { name: "van".into(), boot_id: 1, grpc: "a:1".into(), ..Default::default() };
         let vehicle = v1::Vehicle { map_age_ms: Some(50.0), state: "ok".into(), server: "hq".into(), ..vehicle };

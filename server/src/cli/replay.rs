@@ -16,7 +16,7 @@ use crate::arguments::model::ModelParser;
 use crate::arguments::values::{extrinsics, offset, seconds};
 use crate::process::stdin;
 use crate::process::stop_signal;
-use crate::terminal::{Exit, draw_progress, print, print_line, usage_error};
+use crate::terminal::{Exit, draw_progress, print, print_line, printable, usage_error};
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI, nuScenes and PCD files or folders.
 ///
@@ -172,7 +172,7 @@ pub async fn run(arguments: ReplayArguments) -> Result<Exit> {
     let summary = replay.play(stop).await;
     drop(bar);
     let summary = summary?;
-    summary.remarks().iter().for_each(|remark| eprintln!("{remark}"));
+    summary.remarks().iter().for_each(|remark| eprintln!("{}", printable(remark)));
     if json {
         print_line(&format!("{:#}", summary.to_json()))?
     } else {

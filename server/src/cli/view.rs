@@ -10,7 +10,7 @@ use clearway_replay::{ReplayOptions, ReplayRun, ServedReplay, describe};
 
 use crate::arguments::values::offset;
 use crate::process::stop_signal;
-use crate::terminal::{Exit, print_line};
+use crate::terminal::{Exit, print_line, printable};
 
 /// Look at recorded drives on the page: paused at the first map, with a time bar, a step and all layers.
 ///
@@ -57,6 +57,6 @@ pub async fn run(arguments: ViewArguments) -> Result<Exit> {
         }
     };
     let summary = tokio::join!(replay.play(stop), first_maps).0?;
-    summary.remarks().iter().for_each(|remark| eprintln!("{remark}"));
+    summary.remarks().iter().for_each(|remark| eprintln!("{}", printable(remark)));
     Ok(Exit::from_incomplete(!summary.truncated.is_empty()))
 }

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::base::file_advice::{advised, read_text};
 use error::{ValueError, beside};
 use layers::Layers;
-use overrides::{blamed, matching, set};
+use overrides::{blamed, matching, placed, set};
 use read::{Problem, Refusal};
 
 mod connections;
@@ -260,18 +260,12 @@ impl Config {
         Ok(explain::explained(&config.to_toml(), &layers.given()))
     }
 
-    /// Checks that nothing is served to other hosts without protection, unless `connections.unprotected` names it. For
-    /// a server that starts: the configuration of a recording is not served.
+    /// Checks that nothing is served to other hosts without protection, unless `connections.unprotected` names it.
     ///
     /// # Errors
-    /// [`ConfigError::Value`] for the first address that other hosts can reach without TLS, or from any sender: of the
-    /// override that gave it, else of the file.
+    /// [`ConfigError::Value`] for the first address that other hosts can reach without TLS, or from any sender.
     pub fn check_exposure(&self, file: &Path, overrides: &[String]) -> Result<(), ConfigError> {
-        self.check_exposed_values().map_err(|error| {
-            let is_overridden = matching(overrides, &error.key).next().is_some();
-            let options = Origin::Options(blamed(overrides, &error.key));
-            error.at(&if is_overridden { options } else { Origin::file(file) })
-        })
+        self.check_exposed_values().map_err(|error| placed(error, overrides, file))
     }
 
     /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground,

@@ -3,7 +3,9 @@
 //! An override is a text: `grpc.listen=0.0.0.0:50051` of an option, or `$CLEARWAY__GRPC__LISTEN=0.0.0.0:50051` of a
 //! variable. `vehicle[car2].queue` names one vehicle, by its name or its index; without brackets the first is meant.
 
-use super::error::{ConfigError, Origin};
+use std::path::Path;
+
+use super::error::{ConfigError, Origin, ValueError};
 use super::layers::{Given, Layers, Node};
 use super::read::plain_key;
 
@@ -50,6 +52,15 @@ pub(super) fn blamed(overrides: &[String], key: &str) -> Vec<String> {
         Some(text) => vec![shown(text)],
         None => overrides.iter().map(|text| shown(text)).collect(),
     }
+}
+
+/// The error of a value that was given in the overrides, else in the file.
+pub(super) fn placed(error: ValueError, overrides: &[String], file: &Path) -> ConfigError {
+    let origin = match matching(overrides, &error.key).next() {
+        Some(_) => Origin::Options(blamed(overrides, &error.key)),
+        None => Origin::file(file),
+    };
+    error.at(&origin)
 }
 
 /// Applies the override `a.b=value`; the value is TOML, or a bare string.

@@ -28,6 +28,17 @@ pub struct Udp {
     pub ports: BTreeMap<String, Ports>,
 }
 
+impl Udp {
+    /// The key that names the address of a socket.
+    pub fn key_of(&self, at: SocketAddr) -> &'static str {
+        match at {
+            _ if at == self.data => "vehicle.udp.data",
+            _ if at == self.telemetry => "vehicle.udp.telemetry",
+            _ => "vehicle.udp.ports",
+        }
+    }
+}
+
 impl Default for Udp {
     fn default() -> Self {
         let at = |port| SocketAddr::new(Ipv4Addr::LOCALHOST.into(), port);

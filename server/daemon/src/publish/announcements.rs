@@ -24,8 +24,8 @@ const PERIOD: Duration = Duration::from_secs(1);
 const ALL: &str = "clearway/@fleet/*/*";
 
 /// Announces the vehicles of this server until the tasks end, each with the `address` at which its maps are served over
-/// gRPC and the URL of the `page`; they are empty if others cannot reach them. Returns the keys of the announcements, to
-/// [`take_back`] when the server ends.
+/// gRPC and the URL of the `page`; they are empty if others cannot reach them. Returns the keys of the announcements,
+/// to [`take_back`] when the server ends.
 ///
 /// # Errors
 /// [`ZenohError`] if a publisher cannot be declared.
@@ -64,7 +64,7 @@ pub(crate) async fn take_back(session: &Session, keys: &[String]) {
     }
 }
 
-/// Hears the announcements of other servers until the subscriber is dropped, and notes who claims one of our `vehicles`.
+/// Hears the announcements of other servers until the subscriber is dropped, and notes who claims one of `vehicles`.
 /// Refused announcements are logged, at most one a second.
 ///
 /// # Errors

@@ -134,11 +134,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_udp_port_that_another_program_has_is_named_with_its_table_and_what_to_do() {
+    fn a_udp_port_that_another_program_has_is_named_with_its_key_and_what_to_do() {
         let source = std::io::ErrorKind::AddrInUse.into();
-        let source = udp::BindError { vehicle: 0, at: "127.0.0.1:2368".parse().unwrap(), source };
+        let (at, key) = ("127.0.0.1:2368".parse().unwrap(), "vehicle.udp.data");
+        let source = udp::BindError { vehicle: 0, key, at, source };
         let text = StartError::Udp { vehicle: "car".into(), source }.to_string();
-        assert!(text.starts_with("vehicle car: [vehicle.udp] 127.0.0.1:2368: "), "{text}");
+        assert!(text.starts_with("vehicle car: vehicle.udp.data = 127.0.0.1:2368: "), "{text}");
         assert!(text.contains("another program has the port"), "{text}");
     }
 

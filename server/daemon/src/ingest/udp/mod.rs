@@ -39,10 +39,12 @@ pub struct Sockets(Vec<(Socket, SocketAddr, Listener)>);
 
 /// A socket cannot be bound.
 #[derive(Debug, thiserror::Error)]
-#[error("[vehicle.udp] {at}: {source}")]
+#[error("{key} = {at}: {source}")]
 pub struct BindError {
     /// Index of the first vehicle that is configured with the socket.
     pub vehicle: usize,
+    /// The key of the address.
+    pub key: &'static str,
     /// The address in the configuration.
     pub at: SocketAddr,
     /// Error of the operating system.
@@ -58,7 +60,11 @@ impl Sockets {
     pub fn bind(vehicles: &[Vehicle], held: &mut HeldSockets) -> Result<Self, BindError> {
         let bound = listeners(vehicles).into_iter().map(|listener| match bind(&listener, held) {
             Ok((socket, at)) => Ok((socket, at, listener)),
-            Err(source) => Err(BindError { vehicle: listener.routes[0].vehicle, at: listener.at, source }),
+            Err(source) => {
+                let (vehicle, at) = (listener.routes[0].vehicle, listener.at);
+                let key = vehicles[vehicle].udp.as_ref().map_or("vehicle.udp", |udp| udp.key_of(at));
+                Err(BindError { vehicle, key, at, source })
+            }
         });
         Ok(Self(bound.collect::<Result<_, _>>()?))
     }
