@@ -26,7 +26,7 @@ pub struct IngestArguments {
     server: ServerOptions,
     /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447; or, with certificates,
     /// tls/HOST:7447.
-    #[arg(long, value_name = "ENDPOINT")]
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// The vehicle; needed over zenoh, and if the server has several.
     #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]

@@ -25,7 +25,7 @@ pub struct MapOptions {
     server: ServerOptions,
     /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447; or, with
     /// certificates, tls/HOST:7447.
-    #[arg(long, value_name = "ENDPOINT")]
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
     #[arg(long, value_name = "FILE.pub", requires = "zenoh")]

@@ -20,10 +20,16 @@ const VARIABLES: &str = "CLEARWAY_CA, CLEARWAY_CERT and CLEARWAY_KEY name PEM fi
 /// and turns on encryption; `CLEARWAY_CERT` and `CLEARWAY_KEY` name this client's certificate and its private key.
 #[derive(Args)]
 pub struct ServerOptions {
-    /// The server's gRPC address; the environment variables CLEARWAY_CA, CLEARWAY_CERT and CLEARWAY_KEY name PEM files
-    /// of certificates, which encrypt the connection.
-    #[arg(long = "server", global = true, value_name = "HOST:PORT", default_value = ADDRESS, env = "CLEARWAY_SERVER")]
+    /// The server's gRPC address, by default $CLEARWAY_SERVER, else localhost:50051; the environment variables
+    /// CLEARWAY_CA, CLEARWAY_CERT and CLEARWAY_KEY name PEM files of certificates, which encrypt the connection.
+    #[arg(long = "server", global = true, value_name = "HOST:PORT", default_value_t = default_address())]
     pub address: String,
+}
+
+/// The address in `$CLEARWAY_SERVER`, else [`ADDRESS`]. For clap it is a default and not `env`: the variable contradicts
+/// no option.
+fn default_address() -> String {
+    std::env::var("CLEARWAY_SERVER").unwrap_or_else(|_| ADDRESS.to_owned())
 }
 
 impl ServerOptions {
