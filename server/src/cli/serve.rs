@@ -81,9 +81,10 @@ fn reload(running: &Running, configuration: &ConfigurationOptions, old: &Config)
     running.reload(&config, certificates.as_ref()).map_err(|reason| anyhow!("grpc.tls: {reason}"))?;
     let mut config = config.located(file);
     config.recorder.is_numbered = old.recorder.is_numbered;
-    let unchanged = config.without_reloaded(old) == *old;
-    if !unchanged {
-        tracing::warn!("other keys than certificates, tokens, roles and limits have changed: they need a restart");
+    let changed = config.without_reloaded(old).differing_keys(old);
+    if !changed.is_empty() {
+        let keys = changed.into_iter().collect::<Vec<_>>().join(", ");
+        tracing::warn!(keys, "these keys have changed too, and need a restart");
     }
     Ok(())
 }

@@ -150,6 +150,12 @@ async fn verify_names_a_missing_map_a_changed_header_and_a_journal_gap() {
     assert_eq!((report.different, report.events), (0, whole_events - 1));
     assert!(incomplete.contains("event 41 of /car/journal stands in the place of event 40"), "{incomplete}");
     assert!(incomplete.contains("lost in all, by its own count: 1 message of /car/journal"), "{incomplete}");
+
+    let is_lost = |topic: &str, sequence| topic == "/car/journal" && (40..160).contains(&sequence);
+    copy(&whole, &changed_copy, |topic, sequence, data| (!is_lost(topic, sequence)).then_some(data));
+    let (all, report) = (verify(&whole).unwrap().equal, verify(&changed_copy).unwrap());
+    assert!(report.unjudged > 0, "a revolution is lost: {report:?}");
+    assert_eq!((report.different, report.equal + report.unjudged), (0, all), "each recorded layer counts once");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -133,6 +133,8 @@ struct VehicleReplay {
     computed: BTreeMap<(u64, String), Bytes>,
     /// Recorded maps without a computed one, by sequence and layer.
     extra: BTreeSet<(u64, String)>,
+    /// Number of recorded layers that cannot be judged, because events are missing before them.
+    unjudged: u64,
 }
 
 /// Verifies a recording with the recorded configuration of its vehicles. A map that differs and a damaged part are
@@ -236,6 +238,7 @@ impl VehicleReplay {
             lacks_events: false,
             computed: BTreeMap::new(),
             extra: BTreeSet::new(),
+            unjudged: 0,
         })
     }
 
@@ -299,7 +302,7 @@ impl VehicleReplay {
         match computed.map(|computed| as_served(computed, bytes)) {
             Some(computed) if computed == *bytes => report.equal += 1,
             _ if self.lacks_events || self.pipeline.is_none() || self.records == RecordedMaps::None => {
-                report.unjudged += 1;
+                (self.unjudged, report.unjudged) = (self.unjudged + 1, report.unjudged + 1);
             }
             None => _ = self.extra.insert((sequence, layer.to_owned())),
             Some(computed) => report.add(&self.name, sequence, layer, first_difference(bytes, &computed)),
@@ -315,7 +318,7 @@ impl VehicleReplay {
         match computed.map(|computed| sha256(&as_served_with(computed, header))) {
             Some(computed) if computed == recorded => report.equal += 1,
             _ if self.lacks_events || self.pipeline.is_none() || self.records == RecordedMaps::None => {
-                report.unjudged += 1;
+                (self.unjudged, report.unjudged) = (self.unjudged + 1, report.unjudged + 1);
             }
             None => _ = self.extra.insert((sequence, layer.to_owned())),
             Some(computed) => {
@@ -343,15 +346,18 @@ impl VehicleReplay {
         }
         // The recorder writes an event before its map, so a cut can remove only the map of the last event.
         let tail = self.computed.last_key_value().map(|((sequence, _), _)| *sequence);
+        let mut unrecorded = 0_u64;
         for (sequence, layer) in self.computed.keys() {
             if report.cut && Some(*sequence) == tail {
                 report.beyond_cut += 1;
             } else if is_unjudged {
-                report.unjudged += 1;
+                unrecorded += 1;
             } else {
                 report.add(&self.name, *sequence, layer, DifferenceKind::Missing);
             }
         }
+        // After missing events a map has another sequence than it was recorded with, and is counted as recorded.
+        report.unjudged += unrecorded.saturating_sub(self.unjudged);
     }
 }
 

@@ -1,16 +1,35 @@
 //! The whole configuration as TOML, with the place at which each value was given.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use super::Config;
 use super::error::Origin;
 use super::layers::Given;
 
 /// Adds to each line of `toml`, as the `toml` crate writes it, where its value was given; a default has no comment.
 pub(super) fn explained(toml: &str, given: &BTreeMap<String, Given>) -> String {
+    let explained = |(key, line): (Option<String>, &str)| match key.and_then(|key| given.get(&key)) {
+        Some(given) => format!("{line}  # {}\n", place(given)),
+        None => format!("{line}\n"),
+    };
+    keyed(toml).into_iter().map(explained).collect()
+}
+
+impl Config {
+    /// The keys whose values differ in another configuration.
+    pub fn differing_keys(&self, other: &Self) -> BTreeSet<String> {
+        let [own, other] = [self.to_toml(), other.to_toml()];
+        let [own, other] = [&own, &other].map(|toml| keyed(toml).into_iter().collect::<BTreeSet<_>>());
+        own.symmetric_difference(&other).filter_map(|(key, _)| key.clone()).collect()
+    }
+}
+
+/// Each line of `toml` with the path of its key, if it has one.
+fn keyed(toml: &str) -> Vec<(Option<String>, &str)> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     let mut at = String::new();
-    let mut text = String::new();
+    let mut lines = Vec::new();
     for line in toml.lines() {
         if let Some(header) = line.strip_prefix('[') {
             let name = header.trim_matches(['[', ']']);
@@ -22,12 +41,9 @@ pub(super) fn explained(toml: &str, given: &BTreeMap<String, Given>) -> String {
             at = indexed(name, &counts);
         }
         let key = line.split_once(" = ").map(|(key, _)| if at.is_empty() { key.into() } else { format!("{at}.{key}") });
-        match key.and_then(|key| given.get(&key)) {
-            Some(given) => text += &format!("{line}  # {}\n", place(given)),
-            None => text += &format!("{line}\n"),
-        }
+        lines.push((key, line));
     }
-    text
+    lines
 }
 
 fn last(name: &str) -> &str {
