@@ -9,7 +9,7 @@ use crate::process::service_manager;
 use crate::process::{block_on, stop_signal};
 use crate::terminal::{Exit, with_causes};
 use clearway_daemon::base::held_sockets::HeldSockets;
-use clearway_daemon::config::Config;
+use clearway_daemon::config::{Config, differing_keys};
 use clearway_daemon::run::{Running, Server, Setup, ShutdownError};
 
 /// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
@@ -81,7 +81,7 @@ fn reload(running: &Running, configuration: &ConfigurationOptions, old: &Config)
     running.reload(&config, certificates.as_ref()).map_err(|reason| anyhow!("grpc.tls: {reason}"))?;
     let mut config = config.located(file);
     config.recorder.is_numbered = old.recorder.is_numbered;
-    let changed = config.without_reloaded(old).differing_keys(old);
+    let changed = differing_keys(&config.without_reloaded(old).to_toml(), &old.to_toml());
     if !changed.is_empty() {
         let keys = changed.into_iter().collect::<Vec<_>>().join(", ");
         tracing::warn!(keys, "these keys have changed too, and need a restart");

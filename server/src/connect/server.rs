@@ -26,8 +26,8 @@ pub struct ServerOptions {
     pub address: String,
 }
 
-/// The address in `$CLEARWAY_SERVER`, else [`ADDRESS`]. For clap it is a default and not `env`: the variable contradicts
-/// no option.
+/// The address in `$CLEARWAY_SERVER`, else [`ADDRESS`]. For clap it is a default and not `env`: the variable
+/// contradicts no option.
 fn default_address() -> String {
     std::env::var("CLEARWAY_SERVER").unwrap_or_else(|_| ADDRESS.to_owned())
 }

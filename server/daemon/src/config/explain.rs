@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use super::Config;
 use super::error::Origin;
 use super::layers::Given;
 
@@ -16,13 +15,10 @@ pub(super) fn explained(toml: &str, given: &BTreeMap<String, Given>) -> String {
     keyed(toml).into_iter().map(explained).collect()
 }
 
-impl Config {
-    /// The keys whose values differ in another configuration.
-    pub fn differing_keys(&self, other: &Self) -> BTreeSet<String> {
-        let [own, other] = [self.to_toml(), other.to_toml()];
-        let [own, other] = [&own, &other].map(|toml| keyed(toml).into_iter().collect::<BTreeSet<_>>());
-        own.symmetric_difference(&other).filter_map(|(key, _)| key.clone()).collect()
-    }
+/// The keys whose values differ in two configurations, as [`super::Config::to_toml`] writes them.
+pub fn differing_keys(one: &str, other: &str) -> BTreeSet<String> {
+    let [one, other] = [one, other].map(|toml| keyed(toml).into_iter().collect::<BTreeSet<_>>());
+    one.symmetric_difference(&other).filter_map(|(key, _)| key.clone()).collect()
 }
 
 /// Each line of `toml` with the path of its key, if it has one.

@@ -36,6 +36,7 @@ mod zenoh;
 
 pub use connections::{Connections, Service};
 pub use error::{ConfigError, Origin};
+pub use explain::differing_keys;
 #[cfg(feature = "zenoh")]
 pub(crate) use grpc::secret;
 pub use grpc::{Access, Certificates, Grpc, Only, Tls};

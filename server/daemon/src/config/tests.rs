@@ -383,12 +383,12 @@ fn an_address_that_other_hosts_can_reach_needs_protection_or_its_name_in_words()
 fn a_reload_changes_certificates_roles_and_limits_and_nothing_else() {
     let config = |option: &str| Config::parse(NEEDED, Path::new("a.toml"), &[option.to_owned()]).unwrap();
     let old = config("grpc.enabled=true");
+    let changed = |option: &str| differing_keys(&config(option).without_reloaded(&old).to_toml(), &old.to_toml());
     for reloaded in ["connections.max=7", "connections.per_address_max=7", "connections.hosts=[\"car.example\"]"] {
-        assert_eq!(config(reloaded).without_reloaded(&old), old, "{reloaded}");
+        assert!(changed(reloaded).is_empty(), "{reloaded}");
     }
-    for (key, value) in [("grpc.listen", "127.0.0.1:7"), ("zenoh.enabled", "false")] {
-        assert!(config(&format!("{key}={value}")).without_reloaded(&old).differing_keys(&old).iter().eq([key]));
-    }
+    assert!(changed("grpc.listen=127.0.0.1:7").iter().eq(["grpc.listen"]));
+    assert!(changed("zenoh.enabled=false").iter().eq(["zenoh.enabled"]));
 }
 
 /// Three vehicles with common keys; `third` has two sensors of its own.
