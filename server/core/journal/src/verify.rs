@@ -50,7 +50,8 @@ pub struct Report {
     /// Number of maps, of one layer each, that belong to the last event before the cut and are not recorded.
     pub beyond_cut: u64,
     /// Number of layers of maps that follow from events which the file lacks, and which do not equal the computed layer
-    /// or are not recorded. They cannot be judged.
+    /// or are not recorded. They cannot be judged. A layer that is computed under another sequence than it is recorded
+    /// with counts once.
     pub unjudged: u64,
     /// Number of messages that the recorder has dropped, as the file states it.
     pub dropped: u64,
