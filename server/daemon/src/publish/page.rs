@@ -158,10 +158,9 @@ async fn health(State(shown): State<Shown>) -> Response {
 /// Ready: the state of at least one vehicle is no error. A line follows for each vehicle in error that the caller may
 /// reach, with its worst reason.
 async fn ready(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> Response {
-    let lines = shown.vehicles.not_ready(&caller);
-    match shown.vehicles.are_ready() {
-        true => format!("ready\n{lines}").into_response(),
-        false => unavailable(format!("not ready\n{lines}")),
+    match shown.vehicles.readiness(&caller) {
+        (true, lines) => format!("ready\n{lines}").into_response(),
+        (false, lines) => unavailable(format!("not ready\n{lines}")),
     }
 }
 

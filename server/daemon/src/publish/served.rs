@@ -44,10 +44,14 @@ impl Vehicles {
         self.0.is_empty() || self.0.iter().any(|served| served.status.not_ready().is_none())
     }
 
-    /// A line for each vehicle in error that a client may reach, with the worst reason; empty if there is none.
-    pub fn not_ready(&self, caller: &Caller) -> String {
-        let line = |served: &Served| Some(format!("vehicle {}: {}\n", served.status.name, served.status.not_ready()?));
-        self.0.iter().filter(|served| caller.may_reach(&served.status.name)).filter_map(line).collect()
+    /// What [`Vehicles::are_ready`] tells, and a line for each vehicle in error that a client may reach, with the worst
+    /// reason. Each vehicle is asked once, so that no vehicle makes the server ready and stands among those in error.
+    pub fn readiness(&self, caller: &Caller) -> (bool, String) {
+        let asked: Vec<_> = self.0.iter().map(|served| (&*served.status.name, served.status.not_ready())).collect();
+        let is_ready = asked.is_empty() || asked.iter().any(|(_, reason)| reason.is_none());
+        let reachable = asked.into_iter().filter(|(name, _)| caller.may_reach(name));
+        let line = |(name, reason): (&str, Option<String>)| Some(format!("vehicle {name}: {}\n", reason?));
+        (is_ready, reachable.filter_map(line).collect())
     }
 
     /// The status of every vehicle.
