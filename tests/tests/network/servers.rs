@@ -169,6 +169,26 @@ async fn a_server_serves_without_its_router_names_it_and_has_readers_behind_it_o
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_peer_names_the_endpoint_that_does_not_answer_and_not_the_one_that_does() {
+    let (there, near) = router(0, &[]).await;
+    // Nothing listens there now.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let far = format!("tcp/127.0.0.1:{port}");
+    let mut config = config();
+    config.zenoh.enabled = true;
+    (config.zenoh.mode, config.zenoh.listen) = (ZenohMode::Peer, Vec::new());
+    config.zenoh.connect = vec![near.clone(), far.clone()];
+    let car = within("a peer without one of its routers", start(config)).await;
+    away(&car, &[&format!("at {far} for"), "refused"]).await;
+    let (late, _) = router(port, &[]).await;
+    away(&car, &[]).await;
+    within("the first router goes", there.close().into_future()).await.unwrap();
+    away(&car, &[&format!("at {near} for"), "refused"]).await;
+    within("shutdown", car.shutdown()).await.unwrap();
+    late.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_router_that_accepts_connections_and_no_session_is_named_while_serving_goes_on() {
     let refuses = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let at = format!("tcp/{}", refuses.local_addr().unwrap());

@@ -1,7 +1,8 @@
 //! The zenoh session of a server that is the client of a router: opened once a router answers, while serving goes on;
-//! and in the status and the log whether a router is connected, and why none is.
+//! and in the status and the log whether a router is connected, and why none is. Of the other modes: which endpoints of
+//! `zenoh.connect` do not answer.
 
-use std::net::ToSocketAddrs;
+use std::net::{SocketAddr, ToSocketAddrs};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -88,25 +89,69 @@ pub(super) async fn watch(connected: Connected, endpoints: Vec<String>, vehicles
     }
 }
 
+/// Notes in the status of the vehicles, and in the log, which of these endpoints do not answer: no link of the open
+/// session leads to them, and they accept no connection.
+pub(super) async fn watch_each(session: zenoh::Session, endpoints: Vec<String>, vehicles: Vehicles) {
+    let mut away = None::<Away>;
+    let mut every = tokio::time::interval(ASK_PERIOD);
+    while !endpoints.is_empty() {
+        every.tick().await;
+        let links = session.info().links().await;
+        let linked: Vec<SocketAddr> = links.filter_map(|link| link.dst().address().as_str().parse().ok()).collect();
+        let (mut silent, mut reasons) = (Vec::new(), Vec::new());
+        for endpoint in &endpoints {
+            if let Err(reason) = reach(endpoint, &linked).await {
+                silent.push(endpoint.as_str());
+                reasons.push(reason);
+            }
+        }
+        let (silent, reason) = (silent.join(", "), reasons.join("; "));
+        let (since, before) = away.map_or((Instant::now(), String::new()), |away| (away.since, away.reason));
+        match (before == reason, reason.is_empty()) {
+            (true, _) => {}
+            (false, true) => tracing::info!("zenoh: every endpoint of zenoh.connect answers"),
+            (false, false) => tracing::warn!(
+                endpoints = silent,
+                reason,
+                "zenoh: endpoints of zenoh.connect do not answer; serving goes on without them"
+            ),
+        }
+        away = (!reason.is_empty()).then_some(Away { since, endpoints: silent, reason });
+        vehicles.0.iter().for_each(|served| served.status.network.set_away(away.clone()));
+    }
+}
+
 /// Why no session with these endpoints comes about, as far as a connection and the last failure show it.
 async fn why(endpoints: &[String], failure: &str) -> String {
     let mut reasons = Vec::new();
     for endpoint in endpoints {
-        let address = endpoint.split_once('/').map_or(endpoint.as_str(), |(_, address)| address);
-        let address = address.split(['#', '?']).next().unwrap_or(address).to_owned();
-        let connected = async {
-            let resolved = address.clone();
-            // The system's resolver blocks.
-            let found = tokio::task::spawn_blocking(move || resolved.to_socket_addrs()).await;
-            let all: Vec<_> = found.map_err(std::io::Error::other)??.collect();
-            TcpStream::connect(&*all).await
-        };
-        reasons.push(match tokio::time::timeout(ASK_TIMEOUT, connected).await {
-            Ok(Ok(_)) if failure.is_empty() => format!("{address} accepts connections but no session"),
-            Ok(Ok(_)) => format!("{address} accepts connections but no session: {failure}"),
-            Ok(Err(error)) => format!("{address}: {error}"),
-            Err(_) => format!("{address} does not answer"),
+        reasons.push(match reach(endpoint, &[]).await {
+            Ok(address) if failure.is_empty() => format!("{address} accepts connections but no session"),
+            Ok(address) => format!("{address} accepts connections but no session: {failure}"),
+            Err(reason) => reason,
         });
     }
     reasons.join("; ")
+}
+
+/// Connects to an endpoint, unless it is one of the `linked` addresses, and returns its address.
+///
+/// # Errors
+/// Why it accepts no connection.
+async fn reach(endpoint: &str, linked: &[SocketAddr]) -> Result<String, String> {
+    let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
+    let address = address.split(['#', '?']).next().unwrap_or(address).to_owned();
+    let connected = async {
+        let resolved = address.clone();
+        // The system's resolver blocks.
+        let found = tokio::task::spawn_blocking(move || resolved.to_socket_addrs()).await;
+        let all: Vec<_> = found.map_err(std::io::Error::other)??.collect();
+        let is_linked = all.iter().any(|at| linked.contains(at));
+        if is_linked { Ok(()) } else { TcpStream::connect(&*all).await.map(drop) }
+    };
+    match tokio::time::timeout(ASK_TIMEOUT, connected).await {
+        Ok(Ok(())) => Ok(address),
+        Ok(Err(error)) => Err(format!("{address}: {error}")),
+        Err(_) => Err(format!("{address} does not answer")),
+    }
 }

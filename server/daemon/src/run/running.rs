@@ -68,7 +68,7 @@ pub struct Running {
     pub(super) traces: Traces,
     #[cfg(feature = "zenoh")]
     pub(super) connected: super::router::Connected,
-    /// Waits for the router, and watches it.
+    /// Waits for the router and watches it, or watches the endpoints to which a peer connects.
     #[cfg(feature = "zenoh")]
     pub(super) connecting: JoinSet<()>,
 }

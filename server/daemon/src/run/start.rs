@@ -206,7 +206,8 @@ impl Running {
             self.connecting.spawn(router::connect(settings, users, connected));
             return Ok(());
         };
-        let over_zenoh = OverZenoh::start(session, &users).await?;
+        let over_zenoh = OverZenoh::start(session.clone(), &users).await?;
+        self.connecting.spawn(router::watch_each(session, config.zenoh.connect.clone(), self.vehicles.clone()));
         self.zenoh = over_zenoh.endpoints().await;
         self.connected.lock().await.over_zenoh = Some(over_zenoh);
         Ok(())

@@ -235,7 +235,7 @@ impl Metrics {
         let help = "1 if the configuration was read again at the newest SIGHUP, or there was none; else 0.";
         self.single("clearway_config_last_reload_successful", help, is_reloaded);
         let away_s = self.all.first().map(|of| of.status.network.without_router().as_secs_f64());
-        let help = "Time without a zenoh router; 0 if one is connected, or none is configured.";
+        let help = "Time without a zenoh router, or an endpoint of a peer; 0 if it is there, or none is configured.";
         self.single("clearway_zenoh_router_away_seconds", help, away_s);
         let ends = self.all.first().map(|of| of.status.network.certificates()).unwrap_or_default();
         let help = "End of a certificate since the Unix epoch, by its key in the configuration.";

@@ -13,10 +13,11 @@ const AWAY_NAMED_AFTER: Duration = Duration::from_secs(2);
 /// Time before the end of a certificate at which that is named. Ours: a week to write a new one.
 const END_NAMED_BEFORE: Duration = Duration::from_secs(7 * 24 * 3600);
 
-/// The configured zenoh routers, while none of them is connected.
+/// The configured zenoh routers, while none of them is connected; in the modes `peer` and `router` the endpoints of
+/// `zenoh.connect` that do not answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Away {
-    /// Time since which no router is connected.
+    /// Time since which no router is connected, or an endpoint does not answer.
     pub since: Instant,
     /// Endpoints of the routers, as configured.
     pub endpoints: String,
@@ -46,12 +47,12 @@ impl Network {
         Some(locked(&self.listener_fault).clone()).filter(|fault| !fault.is_empty())
     }
 
-    /// Notes that no router is connected; `None`: one is, or none is configured.
+    /// Notes that no router is connected, or which endpoints do not answer; `None`: neither, or none is configured.
     pub fn set_away(&self, away: Option<Away>) {
         *locked(&self.router) = away;
     }
 
-    /// Time since when no router is connected; zero if one is, or none is configured.
+    /// Time since when [`Away`] holds; zero if it does not.
     pub fn without_router(&self) -> Duration {
         locked(&self.router).as_ref().map_or(Duration::ZERO, |away| away.since.elapsed())
     }
