@@ -105,7 +105,7 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// The folder of the configured file. It creates missing folders.
+    /// The folder of the configured file. It creates missing folders, and says so in the log.
     ///
     /// # Errors
     /// [`io::Error`] if the file is a folder, exists and must not be replaced, or if its folder cannot be created.
@@ -117,7 +117,10 @@ impl Folder {
         if options.is_numbered {
             folder.file = next_free_name(&folder.file);
         }
-        fs::create_dir_all(folder.parent())?;
+        if !folder.parent().is_dir() {
+            fs::create_dir_all(folder.parent())?;
+            tracing::info!(folder = %folder.parent().display(), "the folder of the recording did not exist: created");
+        }
         if !folder.replaces && is_taken(&folder.file) {
             if folder.file.symlink_metadata().is_ok() {
                 return Err(ErrorKind::AlreadyExists.into());

@@ -146,3 +146,19 @@ fn a_file_that_a_crash_has_left_is_listed_as_left_and_deleted_in_its_turn() {
 fn parts_of_folder(options: &Options) -> Vec<v1::RecordedPart> {
     Folder::of(options).list()
 }
+
+#[test]
+fn a_folder_that_does_not_exist_is_created_and_named_once_in_the_log() {
+    let temporary = tempfile::tempdir().unwrap();
+    let file = temporary.path().join("drives/car.mcap");
+    let log = temporary.path().join("log");
+    let lines = File::create(&log).unwrap();
+    let subscriber = tracing_subscriber::fmt().with_ansi(false).with_writer(lines).finish();
+    tracing::subscriber::with_default(subscriber, || {
+        folder(&file, false).unwrap();
+        folder(&file, false).unwrap();
+    });
+    let said = fs::read_to_string(&log).unwrap();
+    let named = format!("folder={}", temporary.path().join("drives").display());
+    assert!(said.matches(&named).count() == 1 && said.contains("INFO"), "{said}");
+}
