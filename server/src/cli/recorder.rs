@@ -68,6 +68,7 @@ pub async fn run(RecorderArguments { server, json, request }: RecorderArguments)
         None => Error::msg(status.message().to_owned()),
     };
     let is_status = matches!(request, RecorderSubcommand::Status);
+    let asked_s = if let RecorderSubcommand::Save { seconds, .. } = request { seconds } else { 0 };
     let answer = match request {
         RecorderSubcommand::Start => recorder.start(v1::StartRecordingRequest {}).await,
         RecorderSubcommand::Stop => recorder.stop(v1::StopRecordingRequest {}).await,
@@ -82,12 +83,13 @@ pub async fn run(RecorderArguments { server, json, request }: RecorderArguments)
             return Ok(Exit::Good);
         }
     };
-    let v1::RecordingResponse { status, files } = answer.map_err(refused)?.into_inner();
+    let v1::RecordingResponse { status, files, saved_s } = answer.map_err(refused)?.into_inner();
     let status = status.unwrap_or_default();
     let exit = if status.state == "failed" { Exit::Stale } else { Exit::Good };
     if json {
         let mut document = recorder_json(&status);
         document["saved"] = files.into();
+        document["saved_s"] = saved_s.into();
         print_line(&format!("{document:#}"))?;
         return Ok(exit);
     }
@@ -111,7 +113,18 @@ pub async fn run(RecorderArguments { server, json, request }: RecorderArguments)
     for file in files {
         print_line(&format!("  saved {file}"))?;
     }
+    // Servers of earlier versions do not say it.
+    if saved_s > 0.0 {
+        print_line(&format!("  {}", saved_line(saved_s, asked_s)))?;
+    }
     Ok(exit)
+}
+
+/// How many seconds are saved, and how many were asked for if those are more; 0: the server's number.
+fn saved_line(saved_s: f64, asked_s: u32) -> String {
+    let is_less = saved_s + 0.05 < f64::from(asked_s);
+    let asked = if is_less { format!(" of the {asked_s} s asked for: no more is recorded") } else { String::new() };
+    format!("saved {saved_s:.1} s{asked}")
 }
 
 fn print_parts(parts: &[v1::RecordedPart], json: bool) -> Result<()> {
@@ -139,4 +152,16 @@ fn print_parts(parts: &[v1::RecordedPart], json: bool) -> Result<()> {
     let megabytes = parts.iter().map(|part| part.bytes).sum::<u64>() as f64 / 1e6;
     print_line(&format!("{}, {megabytes:.1} MB", counted(parts.len() as u64, "part")))?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_save_of_fewer_seconds_than_were_asked_for_says_both_numbers() {
+        assert_eq!(saved_line(12.34, 60), "saved 12.3 s of the 60 s asked for: no more is recorded");
+        assert_eq!(saved_line(60.0, 60), "saved 60.0 s");
+        assert_eq!(saved_line(12.34, 0), "saved 12.3 s");
+    }
 }

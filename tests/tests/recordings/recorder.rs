@@ -183,8 +183,9 @@ async fn a_recording_is_stopped_started_saved_and_listed() {
     let wrong = clearway(&["save", "--reason", "../x"]).await;
     let told = String::from_utf8_lossy(&wrong.stderr).into_owned();
     assert_eq!((wrong.status.code(), told.contains("1 to 40 letters")), (Some(3), true), "{told}");
-    let saved = json(&["save", "--reason", "as-json"]).await;
+    let saved = json(&["save", "--reason", "as-json", "--seconds", "86400"]).await;
     assert!(saved["saved"][0].as_str().unwrap().contains("as-json"), "{saved}");
+    assert!((f64::EPSILON..3600.0).contains(&saved["saved_s"].as_f64().unwrap()), "a day is not recorded: {saved}");
     within("shutdown", running.shutdown()).await.unwrap();
     let report = verify(&folder.path().join(format!("car.part-{part:04}.mcap"))).unwrap();
     assert!(report.is_good() && report.equal >= fixture::LAYERS && report.unjudged == 0, "{report:?}");

@@ -63,7 +63,7 @@ impl PageRecorder {
     }
 }
 
-fn answer(v1::RecordingResponse { status, files }: v1::RecordingResponse, error: &str) -> String {
+fn answer(v1::RecordingResponse { status, files, .. }: v1::RecordingResponse, error: &str) -> String {
     let v1::RecorderStatus { state, file, part, .. } = status.unwrap_or_default();
     json!({ "type": "recorder", "state": state, "file": file, "part": part, "files": files, "error": error })
         .to_string()

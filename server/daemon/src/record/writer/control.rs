@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Sender;
+use std::time::{Duration, Instant};
 
 use clearway_proto::v1;
 use tokio::sync::oneshot;
@@ -29,10 +30,31 @@ pub enum Command {
     },
 }
 
+/// What a request has saved; nothing unless it is [`Command::Save`].
+#[derive(Debug, Default)]
+pub(super) struct Saved {
+    /// The saved files.
+    pub files: Vec<PathBuf>,
+    /// How much of the time that was asked for they have.
+    pub recorded: Duration,
+}
+
+/// How much of the `time` before `now` was recorded in these parts: number, begin and end, the oldest first. A time in
+/// two parts counts once.
+pub(super) fn recorded(parts: &[(u64, Instant, Instant)], time: Duration, now: Instant) -> Duration {
+    let (mut left, mut recorded) = (time, Duration::ZERO);
+    for (_, began, ended) in parts {
+        let [from, to] = [began, ended].map(|at| now.saturating_duration_since(*at).min(left));
+        recorded += from.saturating_sub(to);
+        left = to;
+    }
+    recorded
+}
+
 /// A request on its way to the recorder.
 pub(super) struct Request {
     pub command: Command,
-    pub answer: oneshot::Sender<Result<Vec<PathBuf>, String>>,
+    pub answer: oneshot::Sender<Result<Saved, String>>,
 }
 
 /// A request that cannot be followed.
@@ -77,9 +99,9 @@ impl RecorderControl {
         }
         let (answer, answered) = oneshot::channel();
         self.requests.send(Request { command, answer }).map_err(|_| ControlError::NoAnswer)?;
-        let files = answered.await.map_err(|_| ControlError::NoAnswer)?.map_err(ControlError::Refused)?;
-        let files = files.iter().map(|file| file.display().to_string()).collect();
-        Ok(v1::RecordingResponse { files, ..self.status() })
+        let saved = answered.await.map_err(|_| ControlError::NoAnswer)?.map_err(ControlError::Refused)?;
+        let files = saved.files.iter().map(|file| file.display().to_string()).collect();
+        Ok(v1::RecordingResponse { files, saved_s: saved.recorded.as_secs_f64(), ..self.status() })
     }
 
     /// All parts on the disk, oldest first.
@@ -89,6 +111,22 @@ impl RecorderControl {
 
     /// The state and the counts of the recorder, without files.
     pub fn status(&self) -> v1::RecordingResponse {
-        v1::RecordingResponse { status: Some(self.counts.to_proto()), files: Vec::new() }
+        v1::RecordingResponse { status: Some(self.counts.to_proto()), ..v1::RecordingResponse::default() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_save_counts_the_seconds_that_its_parts_have_and_none_twice() {
+        let start = Instant::now();
+        let at = |s| start + Duration::from_secs(s);
+        // Two parts that overlap by a warm-up, a stop of 5 s, and a part that is still written.
+        let parts = [(1, at(0), at(20)), (2, at(18), at(40)), (3, at(45), at(60))];
+        for (asked_s, recorded_s) in [(10, 10), (15, 15), (20, 15), (30, 25), (60, 55), (100, 55)] {
+            assert_eq!(recorded(&parts, Duration::from_secs(asked_s), at(60)), Duration::from_secs(recorded_s));
+        }
     }
 }

@@ -14,7 +14,7 @@ use clearway_proto::v1;
 use flume::{Receiver, RecvTimeoutError};
 use mcap::McapError;
 
-use super::control::{Command, Request};
+use super::control::{Command, Request, Saved, recorded};
 use super::counts::RecorderCounts;
 use super::folder::{Files, RecordError, with_cause};
 use super::handle::{Item, Link, RecordingHandle, WantedPart, link};
@@ -55,8 +55,8 @@ pub struct RecordingWriter<F: Files> {
     newest_part: u64,
     /// Arrival of the newest event; `None` before the first.
     newest_ns: Option<i64>,
-    /// Parts that were closed, and when.
-    closed: VecDeque<(u64, Instant)>,
+    /// Parts that were closed, when they began, and when they were closed.
+    closed: VecDeque<(u64, Instant, Instant)>,
     sync_at: Option<Instant>,
     /// When the newest sync began; a message that waited in the queue meanwhile is no older.
     synced_at: Instant,
@@ -182,7 +182,7 @@ impl<F: Files> RecordingWriter<F> {
     }
 
     /// Answers a request of an operator.
-    fn answer(&mut self, command: &Command, now: Instant) -> Result<Vec<std::path::PathBuf>, String> {
+    fn answer(&mut self, command: &Command, now: Instant) -> Result<Saved, String> {
         match command {
             Command::Start if self.is_stopped => {
                 self.is_stopped = false;
@@ -204,7 +204,7 @@ impl<F: Files> RecordingWriter<F> {
             Command::Split => self.split(now)?,
             Command::Save { seconds, reason } => return self.save(*seconds, reason, now),
         }
-        Ok(Vec::new())
+        Ok(Saved::default())
     }
 
     fn split(&mut self, now: Instant) -> Result<(), String> {
@@ -219,28 +219,31 @@ impl<F: Files> RecordingWriter<F> {
     }
 
     /// Links the parts that hold the last `seconds` into a folder of their own. Their last part ends soon after.
-    fn save(&mut self, seconds: u64, reason: &str, now: Instant) -> Result<Vec<std::path::PathBuf>, String> {
+    fn save(&mut self, seconds: u64, reason: &str, now: Instant) -> Result<Saved, String> {
         let seconds = if seconds == 0 { self.options.save_s } else { seconds };
         self.sync(now);
         let time = Duration::from_secs(seconds);
-        let closed = self.closed.iter().filter(|(_, at)| now.saturating_duration_since(*at) <= time);
-        let open = self.parts.iter().map(|part| part.number);
-        let parts: Vec<u64> = closed.map(|(part, _)| *part).chain(open).collect();
+        let closed = self.closed.iter().copied().filter(|(.., at)| now.saturating_duration_since(*at) <= time);
+        let of_time: Vec<_> = closed.chain(self.parts.iter().map(|part| (part.number, part.began, now))).collect();
+        let parts: Vec<u64> = of_time.iter().map(|(part, ..)| *part).collect();
         if parts.is_empty() {
             return Err("there is no part to save".to_owned());
         }
         let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let name = format!("{}-{reason}", since.as_millis());
         let links = self.files.keep(&parts, &name).map_err(|error| error.to_string())?;
-        tracing::info!(reason, seconds, files = links.len(), "saved the last seconds of the recording");
-        if links.len() < parts.len() {
-            let deleted = parts.len() - links.len();
+        // The oldest parts are deleted first.
+        let deleted = parts.len().saturating_sub(links.len());
+        let saved = Saved { recorded: recorded(&of_time[deleted..], time, now), files: links };
+        let (files, saved_s) = (saved.files.len(), saved.recorded.as_secs_f64());
+        tracing::info!(reason, seconds, saved_s, files, "saved the last seconds of the recording");
+        if deleted > 0 {
             tracing::warn!(reason, seconds, deleted, "parts of the last seconds were deleted before they were saved");
         }
         if self.parts.len() == 1 && !self.waits && !self.is_stopped {
             self.split(now)?;
         }
-        Ok(links)
+        Ok(saved)
     }
 
     fn write(&mut self, item: Item, now: Instant) {
@@ -419,7 +422,7 @@ impl<F: Files> RecordingWriter<F> {
         if let Some(part) = self.parts.remove(index) {
             self.counts.move_to_dropped(&part.unsynced);
             part.file.abandon();
-            self.closed.push_back((number, now));
+            self.closed.push_back((number, part.began, now));
         }
         for vehicle in &mut self.vehicles {
             vehicle.part = vehicle.part.filter(|part| *part != number);
@@ -470,7 +473,7 @@ impl<F: Files> RecordingWriter<F> {
         let number = part.number;
         let losses = if part.topics.iter().any(|(_, dropped)| *dropped > 0) { &*self.reason } else { "" };
         let counts = part.counts(&self.counts, losses, true);
-        let Part { mut file, unsynced, is_needed, .. } = part;
+        let Part { mut file, began, unsynced, is_needed, .. } = part;
         let closed = file.write_counts(&counts).and_then(|()| file.finish());
         if closed.is_ok() && !is_needed && self.files.discard(number).is_ok() {
             self.files.delete_old();
@@ -484,7 +487,7 @@ impl<F: Files> RecordingWriter<F> {
                         self.counts.set_durable(index, vehicle.next_event);
                     }
                 }
-                self.closed.push_back((number, now));
+                self.closed.push_back((number, began, now));
                 self.files.delete_old();
             }
             Err(error) => {
