@@ -1,6 +1,7 @@
 //! Topics of a ROS 2 bag -> the sensors of its vehicle, with their mounts.
 
-use std::path::Path;
+use std::path::PathBuf;
+use std::sync::Arc;
 
 use clearway_daemon::config::Ros;
 use clearway_mapping::config::{Extrinsics, SensorConfig};
@@ -17,10 +18,11 @@ use crate::topics::choice::{SensorTopic, TopicChoice};
 /// roof of a car.
 const MOUNT_HEIGHT_M: f64 = 2.0;
 
-/// The topics of a ROS bag to read.
-pub(super) fn choice(bag: &Path, wanted: &McapOptions) -> Result<TopicChoice, ReplayError> {
-    let offered = AvailableTopics::from_file(bag).map_err(McapError::from).map_err(FilesError::from)?;
-    let choice = offered.choose(&wanted.topics, wanted.sensors_max).map_err(McapError::from);
+/// The topics of the files of a ROS bag to read, and in `wanted` those that it has.
+pub(super) fn choice(bag: &[PathBuf], wanted: &mut McapOptions) -> Result<TopicChoice, ReplayError> {
+    let available = AvailableTopics::from_files(bag).map_err(McapError::from).map_err(FilesError::from)?;
+    let choice = available.choose(&wanted.topics, wanted.sensors_max).map_err(McapError::from);
+    wanted.available = Some(Arc::new(available));
     Ok(choice.map_err(FilesError::from)?)
 }
 

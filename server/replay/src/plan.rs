@@ -50,7 +50,8 @@ pub(super) struct ReplayPlan {
 /// [`ReplayError`] if a file, a recording or the configuration cannot be used.
 pub(super) fn plan(options: &ReplayOptions) -> Result<ReplayPlan, ReplayError> {
     let files = Readings::open(&options.files, McapOptions::default())?;
-    let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
+    let bag: Vec<_> = files.files().filter(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned()).collect();
+    let recorded = bag.first().cloned();
     let journal = match &recorded {
         Some(file) => RecordingReader::open(file)?.header().config.is_some(),
         None => false,
@@ -72,10 +73,11 @@ pub(super) fn plan(options: &ReplayOptions) -> Result<ReplayPlan, ReplayError> {
         vehicle: options.vehicle.clone(),
         topics: options.topics.clone(),
         sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
+        available: None,
     };
-    let mount_from_tf = match recorded.filter(|_| !known.is_mounted) {
-        Some(bag) => known.apply_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
-        None => None,
+    let mount_from_tf = match known.is_mounted || bag.is_empty() {
+        false => known.apply_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
+        true => None,
     };
     if let Some(model) = options.model {
         known.apply_model(model);
@@ -198,7 +200,7 @@ impl KnownVehicle {
     /// if tf has it.
     fn apply_bag(
         &mut self,
-        bag: &Path,
+        bag: &[PathBuf],
         wanted: &mut McapOptions,
         is_given: bool,
     ) -> Result<Option<Mount>, ReplayError> {

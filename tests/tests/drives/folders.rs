@@ -116,6 +116,49 @@ async fn one_drive_in_two_formats_is_refused_and_a_split_bag_is_not() {
     assert_eq!((headers.len(), missing), (4, vec!["bag_2.mcap".as_ref()]));
 }
 
+/// A drive of the sensor `velodyne`, in which the poses and the sensor `rear` begin this time after the start.
+fn drive_that_grows(late_ns: i64) -> Vec<Message> {
+    let mut messages = vec![mount("velodyne", LEVEL), mount("rear", LEVEL)];
+    let is_late = |(_, _, log_ns, _): &Message| *log_ns >= START_NS + late_ns;
+    messages.extend(tf_poses(late_ns + 4 * SCAN_NS, |_| 0).into_iter().filter(is_late));
+    for at_ns in [0, 1, 2].into_iter().flat_map(|scan| [scan * SCAN_NS, late_ns + scan * SCAN_NS]) {
+        let (stamp_ns, end_ns) = (START_NS + at_ns, START_NS + at_ns + SCAN_NS);
+        messages.push(("/points", CLOUD, end_ns, velodyne("velodyne", stamp_ns).to_cdr()));
+        if at_ns >= late_ns {
+            messages.push(("/rear/points", CLOUD, end_ns - 1, velodyne("rear", stamp_ns).to_cdr()));
+        }
+    }
+    messages
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_topic_that_begins_late_is_used_also_if_it_begins_in_a_later_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let late = drive_that_grows(12_000_000_000);
+    let mut sorted = late.clone();
+    sorted.sort_by_key(|(_, _, log_ns, _)| *log_ns);
+    write_bag(&at("late.mcap"), late, "cdr");
+    write_sqlite(&at("late.db3"), &sorted, false);
+    // A bag in two files, of which the first has one sensor without poses; and one whose first file has no sensor.
+    let halves = |name: &str, is_first: fn(&Message) -> bool| {
+        std::fs::create_dir(at(name)).unwrap();
+        let (first, second) = drive_that_grows(5 * SCAN_NS).into_iter().partition::<Vec<_>, _>(is_first);
+        write_bag(&at(name).join("bag_0.mcap"), first, "cdr");
+        write_bag(&at(name).join("bag_1.mcap"), second, "cdr");
+    };
+    halves("grows", |(_, _, log_ns, _)| *log_ns < START_NS + 5 * SCAN_NS);
+    halves("begins", |(topic, _, log_ns, _)| *topic == "/tf_static" && *log_ns == START_NS);
+    for name in ["late.mcap", "late.db3", "grows", "begins"] {
+        let files = vec![at(name)];
+        let (summary, headers) = replayed(ReplayOptions { files, ..ReplayOptions::default() }).await.unwrap();
+        let newest = headers.last().unwrap_or_else(|| panic!("{name} has no map: {:?}", summary.notes));
+        let rear = newest.sensors.iter().find(|sensor| sensor.name == "rear").map(|sensor| sensor.returns);
+        assert!(rear.is_some_and(|returns| returns > 0), "{name}: {rear:?} returns of rear, {:?}", summary.notes);
+        assert_eq!(newest.compensation, "poses", "{name}: {:?}", summary.notes);
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn empty_lines_lost_returns_and_a_wrong_ring_cost_no_scan() {
     let folder = tempfile::tempdir().unwrap();

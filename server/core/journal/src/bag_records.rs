@@ -2,7 +2,7 @@
 //! their times. Nothing is written beside the bag: where SQLite would, it reads a copy. A bag is a file of others: only
 //! plain tables are read, of values and in queries that are limited.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs::File;
 use std::io::{Error, Read};
 use std::path::{Path, PathBuf};
@@ -134,6 +134,15 @@ impl BagRecords {
     /// The part that cannot be read.
     pub(super) fn lost(&self) -> &[LostPart] {
         &self.lost
+    }
+
+    /// The topics with a message.
+    ///
+    /// # Errors
+    /// If the table cannot be read.
+    pub(super) fn with_messages(&self) -> rusqlite::Result<BTreeSet<u16>> {
+        let mut topics = self.bag.prepare("SELECT DISTINCT topic_id FROM messages")?;
+        topics.query_map([], |row| row.get(0))?.collect()
     }
 
     /// The next record; `None` at the end.

@@ -1,5 +1,6 @@
 //! A file -> its records, by the kind of the file: MCAP, or a ROS 2 bag in sqlite.
 
+use std::collections::BTreeSet;
 use std::io::{Error, ErrorKind, Read};
 use std::path::Path;
 
@@ -79,6 +80,15 @@ impl FileRecords {
             Self::Mcap(records) => records.take_described(),
             #[cfg(feature = "sqlite")]
             Self::Bag(_) => Vec::new(),
+        }
+    }
+
+    /// The channels with a message; `None` if the file does not say.
+    pub(super) fn with_messages(&self) -> Option<BTreeSet<u16>> {
+        match self {
+            Self::Mcap(records) => records.with_messages().cloned(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(records) => records.with_messages().ok(),
         }
     }
 

@@ -314,6 +314,19 @@ impl McapReader {
         channels
     }
 
+    /// The channels of which the file says that it has messages, also those that no message so far has; `None` if the
+    /// file does not say, because it is cut or has no summary.
+    ///
+    /// # Errors
+    /// [`McapReadError::Version`] if a later version of clearway wrote it.
+    pub fn announced(&mut self) -> Result<Option<Vec<Arc<Channel>>>, McapReadError> {
+        let Some(ids) = self.records.with_messages() else { return Ok(None) };
+        for record in self.records.take_described() {
+            self.remember(&record)?;
+        }
+        Ok(ids.iter().map(|id| self.channels.get(id).cloned()).collect())
+    }
+
     fn topic(&self, id: u16) -> String {
         self.channels.get(&id).map_or_else(|| format!("channel {id}"), |of| of.topic.clone())
     }

@@ -1,6 +1,6 @@
 //! The end of an MCAP file -> the schemas and channels that its summary repeats, and the places of its records.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Read, Seek, SeekFrom};
 
 use mcap::MAGIC;
@@ -22,6 +22,8 @@ const SUMMARY_BYTES_MAX: u64 = 16 << 20;
 pub(super) struct McapSummary {
     /// The schemas and channels.
     pub(super) described: Vec<Record<'static>>,
+    /// The channels with a message; `None` if the summary does not say.
+    pub(super) with_messages: Option<BTreeSet<u16>>,
     /// Position and kind of the chunks, message indexes, attachments and metadata, of the end of the data and of the
     /// footer. In a file from which a part was cut, or that has one more, a record may be at none of them.
     pub(super) starts: BTreeMap<u64, u8>,
@@ -68,6 +70,10 @@ impl McapSummary {
                 }
                 Record::AttachmentIndex(index) => add(index.offset, op::ATTACHMENT),
                 Record::MetadataIndex(index) => add(index.offset, op::METADATA),
+                Record::Statistics(of) if of.message_count == of.channel_message_counts.values().sum::<u64>() => {
+                    let counts = of.channel_message_counts.iter().filter(|(_, count)| **count > 0);
+                    self.with_messages = Some(counts.map(|(id, _)| *id).collect());
+                }
                 Record::Schema { .. } | Record::Channel(_) => self.described.push(record.into_owned()),
                 _ => {}
             }

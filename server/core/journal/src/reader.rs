@@ -1,8 +1,10 @@
 //! A recording -> its events, its maps and the ROS 2 messages that [`clearway_ros`] decodes, in file order; and the
 //! configuration of the recorded run.
 
+use std::collections::BTreeSet;
 use std::error::Error;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
@@ -178,6 +180,19 @@ impl RecordingReader {
     /// The channels so far, by topic, each with the number of its messages.
     pub fn channels(&self) -> Vec<(&Channel, u64)> {
         self.reader.channels()
+    }
+
+    /// The ROS topics of which the file says that it has messages; `None` if it does not say. See
+    /// [`McapReader::announced`].
+    ///
+    /// # Errors
+    /// As [`RecordingReader::open`].
+    pub fn announced_topics(&mut self) -> Result<Option<BTreeSet<String>>, RecordingError> {
+        let of_ros = |channels: Vec<Arc<Channel>>| {
+            let channels = channels.iter().filter(|channel| matches!(channel.content, Content::Ros(_)));
+            channels.map(|channel| channel.topic.clone()).collect()
+        };
+        Ok(self.reader.announced()?.map(of_ros))
     }
 
     /// Number of bytes read so far.

@@ -1,8 +1,9 @@
 //! One MCAP file -> readings: the journal of one vehicle if the file is a recording of this server, otherwise the ROS 2
-//! messages of the topics that [`AvailableTopics::choose`] chooses.
+//! messages of the topics that [`AvailableTopics::choose`] chooses for its bag.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clearway_daemon::base::counted::counted;
 use clearway_daemon::ingest::queue::Reading;
@@ -28,6 +29,8 @@ pub struct McapOptions {
     pub topics: Vec<String>,
     /// Greatest number of sensors of the vehicle; topics of further sensors are ignored.
     pub sensors_max: usize,
+    /// The topics of the bag, if they are known; else they are read when the bag is opened.
+    pub available: Option<Arc<AvailableTopics>>,
 }
 
 /// An open MCAP file; an iterator over its readings.
@@ -80,13 +83,13 @@ pub enum McapError {
 }
 
 impl Source {
-    /// Opens the file after those `before` it: several files of one bag are decoded as one, and a later part of a
+    /// Opens the file after those `before` it and before those that `follow`: several files of one bag are decoded as one, and a later part of a
     /// recording begins with events that the part before it has, which are passed over.
     ///
     /// # Errors
     /// [`McapError::Recording`] if the file cannot be read or is not an MCAP file, [`McapError::Choice`] if it does not
     /// have a requested topic.
-    pub fn open(file: &Path, options: &McapOptions, before: Before) -> Result<Self, McapError> {
+    pub fn open(file: &Path, options: &McapOptions, before: Before, follow: &[PathBuf]) -> Result<Self, McapError> {
         let recording = RecordingReader::open(file)?;
         let (mut decoder, mut notes) = (before.decoder, Vec::new());
         let is_later_part = |before: &Part| {
@@ -96,7 +99,11 @@ impl Source {
         if recording.header().config.is_some() {
             decoder = None;
         } else if decoder.is_none() {
-            let choice = AvailableTopics::from_file(file)?.choose(&options.topics, options.sensors_max)?;
+            let available = match &options.available {
+                Some(available) => available.clone(),
+                None => Arc::new(AvailableTopics::from_files(&[&[file.to_owned()], follow].concat())?),
+            };
+            let choice = available.choose(&options.topics, options.sensors_max)?;
             notes.clone_from(&choice.notes);
             decoder = Some(choice.decoder());
         }

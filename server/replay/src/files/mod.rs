@@ -165,7 +165,10 @@ impl Readings {
             match kind {
                 Kind::Capture => self.open = Some(Open::Capture(file.clone(), Box::new(capture::Source::open(&file)?))),
                 Kind::Mcap => {
-                    let source = mcap::Source::open(&file, &self.options, std::mem::take(&mut self.before))?;
+                    let follow = self.files.iter().filter(|(_, kind)| *kind == Kind::Mcap);
+                    let follow: Vec<_> = follow.map(|(file, _)| file.clone()).collect();
+                    let before = std::mem::take(&mut self.before);
+                    let source = mcap::Source::open(&file, &self.options, before, &follow)?;
                     self.open = Some(Open::Mcap(file, Box::new(source)));
                 }
                 Kind::Scan => {

@@ -1,4 +1,4 @@
-//! The topics, frames and refused transforms of an MCAP file, from its start.
+//! The topics, frames and refused transforms of a bag, from the start of its files and of each topic.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -22,13 +22,14 @@ pub const NEAR_NS: u64 = 200_000_000;
 /// with that many digits.
 const SAME_MOUNT: f64 = 1e-3;
 
-/// Duration of the start of a file from which its topics are known if tf places a sensor there, in ns. Ours: latched
-/// transforms come first, all other messages come often.
+/// Duration of the start of a bag that is read in any case, in ns. Ours: within it each topic that is there from the
+/// start has shown what it is.
 const START_NS: i64 = 10_000_000_000;
 
-/// The topics of an MCAP file that can be decoded.
+/// The topics of a bag that can be decoded.
 #[derive(Clone, Debug, Default)]
 pub struct AvailableTopics {
+    /// The first file of the bag.
     pub(super) file: PathBuf,
     pub(super) topics: BTreeMap<String, Topic>,
     /// The newest transforms of all frames.
@@ -62,29 +63,56 @@ pub(super) struct Topic {
 }
 
 impl AvailableTopics {
-    /// Reads the topics from the first 10 s of a file; from all of it if tf places no sensor there.
+    /// Reads the topics of the files of a bag: its first 10 s, then of each file as much as is needed until each topic
+    /// that has messages there has shown one, tf places a sensor, and poses are found. All of a file that does not say
+    /// which topics it has.
     ///
     /// # Errors
-    /// [`RecordingError`] if the file cannot be read or is damaged there.
-    pub fn from_file(file: &Path) -> Result<Self, RecordingError> {
-        let mut available = Self { file: file.to_owned(), ..Self::default() };
-        let mut first_ns = None;
-        for message in RecordingReader::open(file)? {
-            let RecordedMessage::Ros { topic, kind, log_ns, bytes } = message? else { continue };
-            let is_start = log_ns.saturating_sub(*first_ns.get_or_insert(log_ns)) <= START_NS;
-            if !is_start && available.has_placed_sensor() {
-                break;
+    /// [`RecordingError`] if the first file cannot be read or is damaged there. What cannot be read of the others is
+    /// told in its turn.
+    pub fn from_files(files: &[PathBuf]) -> Result<Self, RecordingError> {
+        let mut available = Self { file: files.first().cloned().unwrap_or_default(), ..Self::default() };
+        for (index, file) in files.iter().enumerate() {
+            match available.read_file(file, index == 0) {
+                Err(error) if index == 0 => return Err(error),
+                Ok(()) | Err(_) => {}
             }
-            available.insert(topic, kind, &bytes);
         }
         Ok(available)
     }
 
-    /// True if tf joins the frame of a sensor to another frame.
-    fn has_placed_sensor(&self) -> bool {
-        let mut sensors = self.topics.values().filter(|found| found.kind.is_sensor());
+    fn read_file(&mut self, file: &Path, is_first: bool) -> Result<(), RecordingError> {
+        let mut recording = RecordingReader::open(file)?;
+        let announced = recording.announced_topics()?;
+        let is_known = announced.is_some();
+        let mut awaited = announced.unwrap_or_default();
+        awaited.retain(|topic| !self.topics.contains_key(topic));
+        let (mut is_start, mut first_ns) = (is_first, None);
+        for message in recording {
+            if !is_start && is_known && awaited.is_empty() && self.is_placed() && self.is_posed() {
+                break;
+            }
+            let RecordedMessage::Ros { topic, kind, log_ns, bytes } = message? else { continue };
+            is_start &= log_ns.saturating_sub(*first_ns.get_or_insert(log_ns)) <= START_NS;
+            awaited.remove(&topic);
+            self.insert(topic, kind, &bytes);
+        }
+        Ok(())
+    }
+
+    /// True if tf joins the frame of a sensor to another frame, or there is no tf.
+    fn is_placed(&self) -> bool {
         let names = self.frames.names();
-        sensors.any(|found| found.frame_id.as_deref().is_some_and(|frame| names.contains(frame)))
+        let is_joined = |found: &Topic| found.frame_id.as_deref().is_some_and(|frame| names.contains(frame));
+        let has_tf = self.topics.values().any(|found| found.kind == Kind::TfMessage);
+        !has_tf || self.topics.values().any(|found| found.kind.is_sensor() && is_joined(found))
+    }
+
+    /// True if the vehicle's poses are found, or nothing moves.
+    fn is_posed(&self) -> bool {
+        let is_pose = |found: &Topic| matches!(found.kind, Kind::Odometry | Kind::PoseStamped);
+        let moves = !self.moving.is_empty() || self.topics.values().any(is_pose);
+        !moves || self.best_pose(&self.best_sensors(), &self.ego_frame()).is_some()
     }
 
     fn insert(&mut self, topic: String, kind: Kind, bytes: &[u8]) {

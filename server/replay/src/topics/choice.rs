@@ -1,4 +1,4 @@
-//! Chooses the topics of an MCAP file to decode: the requested topics, or the sensors and the best poses in the file.
+//! Chooses the topics of a bag to decode: the requested topics, or the sensors and the best poses in the file.
 //!
 //! Where the file states a mount and the transform was refused, no mount is guessed: the sensor has the reason.
 
@@ -25,14 +25,14 @@ pub enum ChoiceError {
     /// The file cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// The file does not have a requested topic.
+    /// The bag does not have a requested topic.
     #[error("{}: --topic {topic}: the file has: {known}", file.display())]
     Topic {
-        /// Path of the file.
+        /// Path of its first file.
         file: PathBuf,
         /// The topic that `--topic` names.
         topic: String,
-        /// The topics of the file, with their types.
+        /// The topics of the bag, with their types.
         known: String,
     },
 }
@@ -82,7 +82,7 @@ impl AvailableTopics {
     /// stamps of the sensors.
     ///
     /// # Errors
-    /// [`ChoiceError::Topic`] if the file does not have a requested topic.
+    /// [`ChoiceError::Topic`] if the bag does not have a requested topic.
     pub fn choose(&self, requested: &[String], sensors_max: usize) -> Result<TopicChoice, ChoiceError> {
         for topic in requested {
             if !self.topics.contains_key(topic) {
@@ -124,7 +124,7 @@ impl AvailableTopics {
 
     /// The vehicle's frame: the frame of the tf tree to which the frame of a sensor is joined; without tf the child
     /// frame of the first odometry, else `base_link`.
-    fn ego_frame(&self) -> String {
+    pub(super) fn ego_frame(&self) -> String {
         let names = self.frames.names();
         let candidates: Vec<&str> = EGO_FRAMES
             .into_iter()
@@ -178,7 +178,7 @@ impl AvailableTopics {
         }
     }
 
-    fn best_sensors(&self) -> Vec<&String> {
+    pub(super) fn best_sensors(&self) -> Vec<&String> {
         let mut best: BTreeMap<&str, (&String, &Topic)> = BTreeMap::new();
         for (topic, found) in self.topics.iter().filter(|(_, found)| found.kind.is_sensor()) {
             let frame = found.frame_id.as_deref().unwrap_or_default();
@@ -199,7 +199,7 @@ impl AvailableTopics {
         best.into_iter().map(|(topic, _)| topic).collect()
     }
 
-    fn best_pose(&self, sensors: &[&String], ego_frame: &str) -> Option<PoseSource> {
+    pub(super) fn best_pose(&self, sensors: &[&String], ego_frame: &str) -> Option<PoseSource> {
         let topics_of = |kind: Kind| {
             let mut topics: Vec<_> = self.topics.iter().filter(|(_, found)| found.kind == kind).collect();
             topics.sort_by_key(|(_, found)| found.order);

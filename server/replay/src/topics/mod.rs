@@ -2,8 +2,8 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`available`] | MCAP file -> its topics, frames and refused transforms |
-//! | [`choice`] | topics of an MCAP file -> the topics to decode |
+//! | [`available`] | files of a bag -> their topics, frames and refused transforms |
+//! | [`choice`] | topics of a bag -> the topics to decode |
 
 pub mod available;
 pub mod choice;
