@@ -27,9 +27,9 @@ use super::options::ReplayOptions;
 use super::overrides::overridden;
 use super::recordings::{Recorded, check_sensors, files_of_vehicle, several_vehicles};
 use super::summary::{Mount, describe};
+use crate::files::Readings;
 use crate::files::ground_revolutions::{GroundRevolutions, points_of};
 use crate::files::mcap::McapOptions;
-use crate::files::{Kind, Readings};
 use crate::player::faults::Faults;
 use crate::player::timeline::{Timeline, Track};
 use crate::topics::choice::SensorTopic;
@@ -50,7 +50,7 @@ pub(super) struct ReplayPlan {
 /// [`ReplayError`] if a file, a recording or the configuration cannot be used.
 pub(super) fn plan(options: &ReplayOptions) -> Result<ReplayPlan, ReplayError> {
     let files = Readings::open(&options.files, McapOptions::default())?;
-    let bag: Vec<_> = files.files().filter(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned()).collect();
+    let bag = files.bag();
     let recorded = bag.first().cloned();
     let journal = match &recorded {
         Some(file) => RecordingReader::open(file)?.header().config.is_some(),
@@ -75,10 +75,8 @@ pub(super) fn plan(options: &ReplayOptions) -> Result<ReplayPlan, ReplayError> {
         sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
         available: None,
     };
-    let mount_from_tf = match known.is_mounted || bag.is_empty() {
-        false => known.apply_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
-        true => None,
-    };
+    let is_given = options.extrinsics.is_some();
+    let mount_from_tf = if known.is_mounted { None } else { known.apply_bag(&bag, &mut wanted, is_given)? };
     if let Some(model) = options.model {
         known.apply_model(model);
     }

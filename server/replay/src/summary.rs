@@ -222,13 +222,25 @@ fn snapshot_lines(snapshot: &Snapshot) -> Vec<String> {
         let first = snapshot.refusals.get(reason).map_or(String::new(), |first| format!("; the first: {first}"));
         format!("  refused for {reason}: {n}{first}")
     }));
+    if ledger.poses_refused > 0 {
+        let first = snapshot.refusals.get("pose").map_or(String::new(), |first| format!("; the first: {first}"));
+        lines.push(format!("{} refused{first}", counted(ledger.poses_refused, "pose")));
+    }
+    if ledger.points_dropped > 0 {
+        let points = counted(ledger.points_dropped, "point");
+        lines.push(format!("{points} dropped: not finite, or beyond the reach of any sensor"));
+    }
     let several = snapshot.sensors.len() > 1;
     for sensor in &snapshot.sensors {
         let model = sensor.status.model.map_or("unknown model", clearway_lidar::model::Model::as_str);
         let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
         let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
         let (revolutions, returns) = (counted(revolutions, "revolution"), counted(returns, "return"));
-        lines.push(format!("{}: {model}{rpm}, {revolutions}, {returns}", sensor.name));
+        let missing = match sensor.status.packets_lost {
+            0 => String::new(),
+            missing => format!(", {} missing", counted(missing, "packet")),
+        };
+        lines.push(format!("{}: {model}{rpm}, {revolutions}, {returns}{missing}", sensor.name));
         if several && sensor.is_reference {
             lines.push("  reference sensor: its scans make the maps".to_owned());
         }
@@ -264,6 +276,7 @@ fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
         json!({
             "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
             "revolutions": sensor.status.revolutions,
+            "packets_missing": sensor.status.packets_lost,
             "elevations": sensor.elevations.map(ElevationSource::as_str),
             "remarks": remarks(sensor),
         })
@@ -273,6 +286,8 @@ fn snapshot_json(snapshot: &Snapshot) -> Map<String, Value> {
         "refusals": snapshot.refusals,
         "telemetry": ledger.telemetry,
         "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+        "poses_refused": ledger.poses_refused,
+        "points_dropped": ledger.points_dropped,
         "revolutions": snapshot.revolutions(),
         "maps": snapshot.maps,
         "maps_with_pose": snapshot.maps_with_pose,
@@ -321,7 +336,32 @@ pub fn describe(mount: &Mount) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use clearway_lidar::SensorStatus;
+    use clearway_mapping::ledger::Ledger;
+
     use super::*;
+
+    #[test]
+    fn what_was_refused_dropped_or_never_arrived_is_in_the_lines() {
+        let mut snapshot = Snapshot::default();
+        (snapshot.ledger.poses_refused, snapshot.ledger.points_dropped) = (2, 840);
+        snapshot.refusals.insert("pose", "pose at x = 1e9 m".into());
+        snapshot.sensors.push(NamedStatus {
+            source: 0,
+            name: "top".into(),
+            is_reference: false,
+            status: SensorStatus { packets_lost: 60, ..SensorStatus::default() },
+            elevations: None,
+            mount: None,
+            other_clock: Default::default(),
+            ledger: Ledger::default(),
+        });
+        let lines = snapshot_lines(&snapshot).join("\n");
+        for said in ["2 poses refused; the first: pose at x = 1e9 m", "840 points dropped", "top: unknown model, "] {
+            assert!(lines.contains(said), "{lines}");
+        }
+        assert!(lines.contains(", 60 packets missing"), "{lines}");
+    }
 
     #[test]
     fn files_of_telemetry_alone_are_called_so() {

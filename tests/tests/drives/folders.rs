@@ -107,6 +107,8 @@ async fn one_drive_in_two_formats_is_refused_and_a_split_bag_is_not() {
         ..ReplayOptions::default()
     });
     std::fs::write(&file, format!("{metadata}  duration:\n")).unwrap();
+    // What a macOS computer adds to a copied file.
+    std::fs::write(split.path().join("._bag_0.mcap"), "no bag").unwrap();
     let (summary, headers) = replayed(options()).await.unwrap();
     assert_eq!((headers.len(), summary.truncated.len()), (4, 0));
     // A part that metadata.yaml names and the folder does not have.

@@ -151,6 +151,10 @@ pub fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError
     let (mut files, mut to_convert) = (Vec::new(), None);
     for entry in std::fs::read_dir(folder).map_err(open)? {
         let file = entry.map_err(open)?.path();
+        // A copy of a macOS folder has a `._NAME` beside each file.
+        if is_hidden(&file) {
+            continue;
+        }
         if file.is_file() && kind_by_name(&file).is_some() {
             files.push((file.clone(), kind(&file)?));
         } else if file.is_file()
@@ -167,6 +171,10 @@ pub fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError
     }
     files.sort_by_cached_key(|(file, _)| order_of(file));
     Ok(files)
+}
+
+fn is_hidden(file: &Path) -> bool {
+    file.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
 }
 
 /// The first folder of a folder that has a file of a known kind.

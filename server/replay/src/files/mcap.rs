@@ -83,8 +83,8 @@ pub enum McapError {
 }
 
 impl Source {
-    /// Opens the file after those `before` it and before those that `follow`: several files of one bag are decoded as one, and a later part of a
-    /// recording begins with events that the part before it has, which are passed over.
+    /// Opens the file after those `before` it and before those that `follow`: several files of one bag are decoded as
+    /// one, and a later part of a recording begins with events that the part before it has, which are passed over.
     ///
     /// # Errors
     /// [`McapError::Recording`] if the file cannot be read or is not an MCAP file, [`McapError::Choice`] if it does not

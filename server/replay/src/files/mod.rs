@@ -103,6 +103,11 @@ impl Readings {
         self.files.iter().map(|(file, kind)| (file.as_path(), *kind))
     }
 
+    /// Those of them that are MCAP files or bags.
+    pub fn bag(&self) -> Vec<PathBuf> {
+        self.files().filter(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned()).collect()
+    }
+
     /// Number of bytes of these files.
     pub fn bytes(&self) -> u64 {
         self.files.iter().filter_map(|(file, _)| file.metadata().ok()).map(|metadata| metadata.len()).sum()
@@ -165,10 +170,8 @@ impl Readings {
             match kind {
                 Kind::Capture => self.open = Some(Open::Capture(file.clone(), Box::new(capture::Source::open(&file)?))),
                 Kind::Mcap => {
-                    let follow = self.files.iter().filter(|(_, kind)| *kind == Kind::Mcap);
-                    let follow: Vec<_> = follow.map(|(file, _)| file.clone()).collect();
                     let before = std::mem::take(&mut self.before);
-                    let source = mcap::Source::open(&file, &self.options, before, &follow)?;
+                    let source = mcap::Source::open(&file, &self.options, before, &self.bag())?;
                     self.open = Some(Open::Mcap(file, Box::new(source)));
                 }
                 Kind::Scan => {
