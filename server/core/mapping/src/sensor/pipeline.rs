@@ -224,8 +224,8 @@ impl SensorPipeline {
         if scan.completed > 0 && scan.is_revolution && revolution.epoch > scan.state.epoch {
             motion.begin_epoch(scan.completed_at.event_ns);
         }
-        let step_ns = self.clock.note([revolution.start_ns, revolution.end_ns], now.event_ns);
-        motion.note_scan(revolution.end_ns, now.event_ns, step_ns);
+        self.clock.note([revolution.start_ns, revolution.end_ns], now.event_ns);
+        motion.note_scan(revolution.end_ns, now.event_ns, &mut self.clock);
         let (mount, filter) = (&self.mount, self.filter.as_ref());
         motion.follow_revolution(revolution, &mut self.trajectory);
         let sweep = scan.next_sweep();
@@ -281,7 +281,7 @@ impl SensorPipeline {
             *epoch = epoch.saturating_add(1);
             motion.begin_epoch(accepted_ns);
         }
-        motion.note_scan(scan.stamp_ns, now.event_ns, self.clock.step_ns());
+        motion.note_scan(scan.stamp_ns, now.event_ns, &mut self.clock);
         self.newest_scan = Some((scan.stamp_ns, now.event_ns));
         self.find_elevations(scan);
         motion.follow_scan(scan, &mut self.trajectory);

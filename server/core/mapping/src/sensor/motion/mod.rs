@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::sensor::observation::{EgoPose, Scan};
 pub(crate) use knots::{KNOT_FIRINGS, ScanKnots, knots};
-use stamp_clock::{ClockReading, PoseClock, agree};
+use stamp_clock::{ClockReading, PoseClock, ScanClock, agree};
 
 mod knots;
 pub(super) mod stamp_clock;
@@ -158,10 +158,13 @@ impl Motion {
     }
 
     /// Removes the poses if their stamps have stepped back and the scan that was completed at this event time has been
-    /// stamped after the step: its stamp is nearer to the refused poses than to the poses before them. `step_ns` is how
-    /// far the clock of the scan has stepped: unless the clock of the poses has too, no pose is of this scan's clock.
-    pub fn note_scan(&mut self, stamp_ns: i64, event_ns: i64, step_ns: i64) {
-        self.scan_step_ns = step_ns;
+    /// stamped after the step: its stamp is nearer to the refused poses than to the poses before them. Unless the clock
+    /// of the poses has stepped as far as the `clock` of the scan, no pose is of this scan's clock.
+    pub(crate) fn note_scan(&mut self, stamp_ns: i64, event_ns: i64, clock: &mut ScanClock) {
+        if self.map_from_ego(stamp_ns).is_some() {
+            clock.note_pose(self.pose_clock.step_ns());
+        }
+        self.scan_step_ns = clock.step_ns();
         if self.pose_clock.has_stepped_back_with(ClockReading { stamp_ns, event_ns }) {
             self.forget_poses();
         }
@@ -384,10 +387,44 @@ mod tests {
 
     #[test]
     fn without_poses_no_clock_of_poses_differs_from_the_clock_of_the_scan() {
-        let mut motion = Motion::new(&MotionConfig::default());
-        motion.note_scan(0, 0, 300_000_000);
+        let (mut motion, mut clock) = (Motion::new(&MotionConfig::default()), stepped_clock());
+        motion.note_scan(AFTER_NS, AFTER_NS, &mut clock);
         assert_eq!(motion.ahead_of_scan_ns(), None);
-        motion.push_pose(&EgoPose { stamp_ns: 0, map_from_ego: Isometry3::identity(), speed_mps: 0.0 }, 0);
-        assert_eq!(motion.ahead_of_scan_ns(), Some(-300_000_000));
+        motion.push_pose(&pose(0), 0);
+        assert_eq!(motion.ahead_of_scan_ns(), Some(-STEP_NS));
+    }
+
+    #[test]
+    fn a_clock_that_is_set_right_by_a_step_agrees_from_then_on_and_not_after_the_next_step() {
+        let (mut motion, mut clock) = (Motion::new(&MotionConfig::default()), stepped_clock());
+        let mut ahead_ns = |scan: i64, ahead_ns: i64| {
+            let event_ns = AFTER_NS + scan * 100_000_000;
+            motion.push_pose(&pose(event_ns), event_ns);
+            clock.note([event_ns + ahead_ns; 2], event_ns);
+            motion.note_scan(event_ns + ahead_ns, event_ns, &mut clock);
+            motion.ahead_of_scan_ns()
+        };
+        // No scan before the step had a pose.
+        (0..20).for_each(|scan| assert_eq!(ahead_ns(scan, 0), None, "scan {scan}"));
+        (20..30).for_each(|scan| assert_eq!(ahead_ns(scan, 400_000_000), Some(-400_000_000), "scan {scan}"));
+        (30..40).for_each(|scan| assert_eq!(ahead_ns(scan, 0), None, "scan {scan}"));
+    }
+
+    const STEP_NS: i64 = 300_000_000;
+    /// Event time after the scans of [`stepped_clock`].
+    const AFTER_NS: i64 = 2_000_000_000;
+
+    fn pose(stamp_ns: i64) -> EgoPose {
+        EgoPose { stamp_ns, map_from_ego: Isometry3::identity(), speed_mps: 0.0 }
+    }
+
+    /// A clock that was 0.3 s behind for a second, and right for the second after it.
+    fn stepped_clock() -> ScanClock {
+        let mut clock = ScanClock::default();
+        for scan in 0..20 {
+            let behind_ns = if scan < 10 { STEP_NS } else { 0 };
+            clock.note([scan * 100_000_000 - behind_ns; 2], scan * 100_000_000);
+        }
+        clock
     }
 }

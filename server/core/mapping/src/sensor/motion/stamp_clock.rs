@@ -180,26 +180,38 @@ impl PoseClock {
 pub(crate) struct ScanClock {
     /// Of the first points, and of the last points.
     ends: [StampClock; 2],
+    /// How far the clock of the poses had stepped when a scan first had a pose, ns; `None` before.
+    agreed_ns: Option<i64>,
 }
 
 impl ScanClock {
-    /// Notes a scan by the stamps of its first and its last point. Returns how far the clock has stepped since the
-    /// first scan, ns: what both ends show, because where a scan begins and ends depends on its surroundings too.
-    pub fn note(&mut self, stamps_ns: [i64; 2], event_ns: i64) -> i64 {
+    /// Notes a scan by the stamps of its first and its last point. A step is what both ends show, because where a scan
+    /// begins and ends depends on its surroundings too.
+    pub fn note(&mut self, stamps_ns: [i64; 2], event_ns: i64) {
         for (end, stamp_ns) in self.ends.iter_mut().zip(stamps_ns) {
             end.note(ClockReading { stamp_ns, event_ns });
         }
-        self.step_ns()
     }
 
-    /// How far the clock has stepped since the first scan, ns; 0 if it has stepped back.
+    /// How far the clock has stepped since it agreed with the clock of the poses, or since the first scan, ns; 0 if it
+    /// has stepped back.
     pub fn step_ns(&self) -> i64 {
         let [first_ns, last_ns] = [self.ends[0].step_ns(), self.ends[1].step_ns()];
-        if first_ns.unsigned_abs() < last_ns.unsigned_abs() { first_ns } else { last_ns }
+        let step_ns = if first_ns.unsigned_abs() < last_ns.unsigned_abs() { first_ns } else { last_ns };
+        step_ns.saturating_add(self.agreed_ns.unwrap_or(0))
+    }
+
+    /// Notes that there is a pose at the stamp of a scan, and how far the clock of the poses has stepped, ns. If it is
+    /// the first such scan, the clocks agree since a step: a clock that was wrong at first has been set right.
+    pub fn note_pose(&mut self, pose_step_ns: i64) {
+        if self.agreed_ns.is_none() {
+            self.agreed_ns = Some(pose_step_ns);
+            self.ends.iter_mut().for_each(|end| end.before_ns = None);
+        }
     }
 }
 
-/// True if two clocks that agreed at first agree after these steps, ns.
+/// True if two clocks that agreed agree after these steps, ns.
 pub(super) fn agree(a_step_ns: i64, b_step_ns: i64) -> bool {
     a_step_ns.abs_diff(b_step_ns) <= STEP_NS_MIN
 }
