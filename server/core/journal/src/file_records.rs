@@ -86,7 +86,7 @@ impl FileRecords {
     /// The channels with a message; `None` if the file does not say.
     pub(super) fn with_messages(&self) -> Option<BTreeSet<u16>> {
         match self {
-            Self::Mcap(records) => records.with_messages().cloned(),
+            Self::Mcap(records) => records.summary.with_messages.clone(),
             #[cfg(feature = "sqlite")]
             Self::Bag(records) => records.with_messages().ok(),
         }

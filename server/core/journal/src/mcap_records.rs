@@ -5,7 +5,6 @@
 //! record if the head of another record is there, else at the next record that the summary of the file names. Without a
 //! summary, a damaged length costs the rest of the file.
 
-use std::collections::BTreeSet;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 use crc32fast::Hasher;
@@ -82,7 +81,7 @@ pub(super) struct McapRecords {
     /// Position of the next record.
     offset: u64,
     section: Section,
-    summary: McapSummary,
+    pub(super) summary: McapSummary,
     chunk: OpenChunk,
     /// Bytes of the chunks so far, decompressed.
     decompressed: u64,
@@ -146,11 +145,6 @@ impl McapRecords {
     /// The schemas and channels that the summary repeats; a second call returns none.
     pub(super) fn take_described(&mut self) -> Vec<Record<'static>> {
         std::mem::take(&mut self.summary.described)
-    }
-
-    /// The channels with a message, as far as the summary says.
-    pub(super) fn with_messages(&self) -> Option<&BTreeSet<u16>> {
-        self.summary.with_messages.as_ref()
     }
 
     /// The next record; `None` at the end. Chunks are not returned, but their records are.
