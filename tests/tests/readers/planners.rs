@@ -243,7 +243,7 @@ async fn survive(mut other: Planner) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(
     not(clearway_cpp_grpc),
-    ignore = "needs C++ and gRPC: apt-get install g++ cmake libgrpc++-dev libprotobuf-dev"
+    ignore = "needs C++ and gRPC: apt-get install g++ cmake libgrpc++-dev libprotobuf-dev protobuf-compiler-grpc"
 )]
 async fn a_planner_in_cpp_survives_a_proxy_that_cuts_and_a_server_that_is_killed() {
     let answers = tokio::task::spawn_blocking(|| of_cpp("answers")).await.expect("it is compiled");
@@ -262,7 +262,7 @@ async fn a_planner_in_python_survives_a_proxy_that_cuts_and_a_server_that_is_kil
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(
     not(clearway_cpp_grpc),
-    ignore = "needs C++ and gRPC: apt-get install g++ cmake libgrpc++-dev libprotobuf-dev"
+    ignore = "needs C++ and gRPC: apt-get install g++ cmake libgrpc++-dev libprotobuf-dev protobuf-compiler-grpc"
 )]
 async fn a_planner_in_cpp_waits_no_longer_than_it_asks_and_is_told_of_a_wrong_address_and_vehicle() {
     let answers = tokio::task::spawn_blocking(|| of_cpp("answers")).await.expect("it is compiled");
@@ -282,7 +282,7 @@ async fn a_planner_in_cpp_waits_no_longer_than_it_asks_and_is_told_of_a_wrong_ad
 #[test]
 #[cfg_attr(
     not(clearway_cpp_grpc),
-    ignore = "needs C++ and gRPC: apt-get install g++ cmake libgrpc++-dev libprotobuf-dev"
+    ignore = "needs C++ and gRPC: apt-get install g++ cmake libgrpc++-dev libprotobuf-dev protobuf-compiler-grpc"
 )]
 fn the_cpp_example_follows_a_drive_to_its_end() {
     let follow = of_cpp("follow");

@@ -2,7 +2,8 @@
 //
 // A stream has one map in flight and acknowledges it when the reader asks for the next map, so the server holds the
 // newest map for the reader, and skips and counts the maps between. Messages are read and written as bytes: no
-// generated code. Needs gRPC's C++ library (Debian: libgrpc++-dev), the CMake target `clearway::grpc`.
+// generated code. Needs gRPC's C++ library (Debian: libgrpc++-dev, protobuf-compiler-grpc), the CMake target
+// `clearway::grpc`.
 #pragma once
 
 #include <algorithm>
