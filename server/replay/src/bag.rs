@@ -18,7 +18,7 @@ use crate::topics::choice::{SensorTopic, TopicChoice};
 /// roof of a car.
 const MOUNT_HEIGHT_M: f64 = 2.0;
 
-/// The topics of the files of a ROS bag to read, and in `wanted` those that it has.
+/// Chooses the topics to read from the files of a ROS bag, and keeps all topics of the bag in `wanted`.
 pub(super) fn choice(bag: &[PathBuf], wanted: &mut McapOptions) -> Result<TopicChoice, ReplayError> {
     let available = AvailableTopics::from_files(bag).map_err(McapError::from).map_err(FilesError::from)?;
     let choice = available.choose(&wanted.topics, wanted.sensors_max).map_err(McapError::from);

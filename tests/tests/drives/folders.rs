@@ -142,7 +142,7 @@ async fn a_topic_that_begins_late_is_used_also_if_it_begins_in_a_later_file() {
     sorted.sort_by_key(|(_, _, log_ns, _)| *log_ns);
     write_bag(&at("late.mcap"), late, "cdr");
     write_sqlite(&at("late.db3"), &sorted, false);
-    // A bag in two files, of which the first has one sensor without poses; and one whose first file has no sensor.
+    // A bag whose first file has one sensor and no poses, and a bag whose first file has no sensor.
     let halves = |name: &str, is_first: fn(&Message) -> bool| {
         std::fs::create_dir(at(name)).unwrap();
         let (first, second) = drive_that_grows(5 * SCAN_NS).into_iter().partition::<Vec<_>, _>(is_first);

@@ -314,8 +314,8 @@ impl McapReader {
         channels
     }
 
-    /// The channels of which the file says that it has messages, also those that no message so far has; `None` if the
-    /// file does not say, because it is cut or has no summary.
+    /// The channels that have messages by the file's own counts, read so far or not; `None` if the file has no counts,
+    /// because it is cut or has no summary.
     ///
     /// # Errors
     /// [`McapReadError::Version`] if a later version of clearway wrote it.

@@ -182,7 +182,7 @@ impl RecordingReader {
         self.reader.channels()
     }
 
-    /// The ROS topics of which the file says that it has messages; `None` if it does not say. See
+    /// The ROS topics that have messages by the file's own counts; `None` if it has no counts. See
     /// [`McapReader::announced`].
     ///
     /// # Errors

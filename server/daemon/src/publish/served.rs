@@ -41,23 +41,33 @@ impl Vehicles {
     /// True if a fresh map of at least one vehicle is made: the fault of one vehicle must not cost the planners of the
     /// others their server.
     pub fn are_ready(&self) -> bool {
-        self.0.is_empty() || self.0.iter().any(|served| served.status.not_ready().is_none())
+        is_any_ready(&self.reasons())
     }
 
     /// What [`Vehicles::are_ready`] tells, and a line for each vehicle in error that a client may reach, with the worst
     /// reason. Each vehicle is asked once, so that no vehicle makes the server ready and stands among those in error.
     pub fn readiness(&self, caller: &Caller) -> (bool, String) {
-        let asked: Vec<_> = self.0.iter().map(|served| (&*served.status.name, served.status.not_ready())).collect();
-        let is_ready = asked.is_empty() || asked.iter().any(|(_, reason)| reason.is_none());
-        let reachable = asked.into_iter().filter(|(name, _)| caller.may_reach(name));
+        let reasons = self.reasons();
+        let is_ready = is_any_ready(&reasons);
+        let reachable = reasons.into_iter().filter(|(name, _)| caller.may_reach(name));
         let line = |(name, reason): (&str, Option<String>)| Some(format!("vehicle {name}: {}\n", reason?));
         (is_ready, reachable.filter_map(line).collect())
+    }
+
+    /// Each vehicle's name, and why it is not ready; `None` if it is.
+    fn reasons(&self) -> Vec<(&str, Option<String>)> {
+        self.0.iter().map(|served| (&*served.status.name, served.status.not_ready())).collect()
     }
 
     /// The status of every vehicle.
     pub fn statuses(&self) -> Vec<Arc<VehicleStatus>> {
         self.0.iter().map(|served| served.status.clone()).collect()
     }
+}
+
+/// True if one of these vehicles is ready, or there is none.
+fn is_any_ready(reasons: &[(&str, Option<String>)]) -> bool {
+    reasons.is_empty() || reasons.iter().any(|(_, reason)| reason.is_none())
 }
 
 impl Served {

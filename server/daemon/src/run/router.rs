@@ -1,6 +1,6 @@
 //! The zenoh session of a server that is the client of a router: opened once a router answers, while serving goes on;
-//! and in the status and the log whether a router is connected, and why none is. Of the other modes: which endpoints of
-//! `zenoh.connect` do not answer.
+//! and in the status and the log whether a router is connected, and why none is; in the other modes, which endpoints
+//! of `zenoh.connect` do not answer.
 
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::sync::Arc;

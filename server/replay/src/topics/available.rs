@@ -64,12 +64,12 @@ pub(super) struct Topic {
 
 impl AvailableTopics {
     /// Reads the topics of the files of a bag: its first 10 s, then of each file as much as is needed until each topic
-    /// that has messages there has shown one, tf places a sensor, and poses are found. All of a file that does not say
-    /// which topics it has.
+    /// that has messages there has shown one, tf places a sensor, and poses are found. A file that does not say which
+    /// topics it has is read whole.
     ///
     /// # Errors
-    /// [`RecordingError`] if the first file cannot be read or is damaged there. What cannot be read of the others is
-    /// told in its turn.
+    /// [`RecordingError`] if the first file cannot be read or is damaged there. A fault of a later file is told when
+    /// the replay reads that file.
     pub fn from_files(files: &[PathBuf]) -> Result<Self, RecordingError> {
         let mut available = Self { file: files.first().cloned().unwrap_or_default(), ..Self::default() };
         for (index, file) in files.iter().enumerate() {

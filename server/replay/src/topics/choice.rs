@@ -1,4 +1,4 @@
-//! Chooses the topics of a bag to decode: the requested topics, or the sensors and the best poses in the file.
+//! Chooses the topics of a bag to decode: the requested topics, or the sensors and the best poses in the bag.
 //!
 //! Where the file states a mount and the transform was refused, no mount is guessed: the sensor has the reason.
 
