@@ -205,6 +205,29 @@ async fn the_queue_of_a_recorder_costs_no_map_its_pose() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn poses_that_are_logged_late_or_seldom_are_of_the_maps_of_their_time() {
+    // Time from one pose to the next, and from its stamp to its log time, ms.
+    for (period_ms, late_ms) in [(20, 300), (20, 900), (500, 0), (500, 300), (1000, 0)] {
+        let mut messages = drive_of(24, |ns| velodyne("velodyne", ns));
+        messages.retain_mut(|(topic, _, log_ns, _)| {
+            let after_ns = *log_ns - START_NS;
+            *log_ns += if *topic == "/tf" { late_ms * 1_000_000 } else { 0 };
+            *topic != "/tf" || after_ns % (period_ms * 1_000_000) == 0
+        });
+        let (summary, headers) = replayed_bag(messages, &[]).await;
+        let what = format!("each {period_ms} ms, {late_ms} ms late: {:?}", xs(&headers));
+        // tf has no speed, and the first pose none before it.
+        let least = (24 - period_ms / 100 - 4) as u64;
+        assert!(headers.len() == 24 && summary.snapshot.maps_with_pose >= least, "{what}");
+        for header in headers {
+            let Some(pose) = &header.map_from_ego else { continue };
+            let driven_m = position_m(header.capture_end_ns - START_NS);
+            assert!((pose.x - driven_m).abs() < 0.05, "{what}: {} m, not {driven_m} m", pose.x);
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn the_source_of_poses_is_judged_by_the_maps_that_have_one() {
     let clouds = |frame: &'static str, shift_ns: i64| {
         (0..3).map(move |scan| {

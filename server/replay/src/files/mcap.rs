@@ -11,6 +11,7 @@ use clearway_daemon::ingest::ros::decoder::TopicDecoder;
 use clearway_journal::reader::{RecordedMessage, RecordingError, RecordingReader};
 use clearway_ros::RefusedPart;
 
+use super::late_poses::LatePoses;
 use super::pose_gap::PoseGap;
 use super::unread_topics::unread_topics;
 use crate::topics::available::AvailableTopics;
@@ -47,7 +48,10 @@ pub struct Source {
     refused: RefusedMessages,
     /// By topic and kind of part: the number of refused parts of used messages, and the fault of the first.
     refused_parts: BTreeMap<(String, &'static str), (u64, String)>,
-    waiting: VecDeque<Reading>,
+    /// The readings of the newest message.
+    decoded: VecDeque<Reading>,
+    late_poses: LatePoses,
+    has_ended: bool,
     pose_gap: PoseGap,
     is_journal: bool,
     is_later_part: bool,
@@ -116,7 +120,9 @@ impl Source {
             refused_topics: BTreeMap::new(),
             refused: RefusedMessages::new(),
             refused_parts: BTreeMap::new(),
-            waiting: VecDeque::new(),
+            decoded: VecDeque::new(),
+            late_poses: LatePoses::default(),
+            has_ended: false,
             pose_gap: PoseGap::default(),
             is_journal: false,
             is_later_part: next_event > 0,
@@ -178,7 +184,7 @@ impl Source {
                     }
                     self.next_event = event.sequence.saturating_add(1);
                     let (arrival_ns, source, body) = (event.arrival_ns, event.source, event.body);
-                    self.waiting.push_back(Reading { arrival_ns, source, body });
+                    self.decoded.push_back(Reading { arrival_ns, source, body });
                 } else {
                     self.ignored.insert(format!("/{vehicle}/journal"));
                 }
@@ -187,7 +193,7 @@ impl Source {
                 let Some(decoder) = self.decoder.as_mut().filter(|decoder| decoder.accepts(&topic, kind)) else {
                     return;
                 };
-                match decoder.decode(&topic, kind, log_ns, &bytes, &mut self.waiting) {
+                match decoder.decode(&topic, kind, log_ns, &bytes, &mut self.decoded) {
                     Ok(parts) => {
                         for RefusedPart { what, count, fault } in parts {
                             let of_topic = self.refused_parts.entry((topic.clone(), what));
@@ -212,14 +218,22 @@ impl Iterator for Source {
     type Item = Result<Reading, McapError>;
 
     fn next(&mut self) -> Option<Self::Item> {
+        // A journal has the order in which the engine took its events.
+        let has_poses = self.decoder.as_ref().is_some_and(TopicDecoder::has_poses);
         loop {
-            if let Some(reading) = self.waiting.pop_front() {
+            self.decoded.drain(..).for_each(|reading| self.late_poses.push(reading));
+            let late = &mut self.late_poses;
+            if let Some(reading) = if has_poses && !self.has_ended { late.pop() } else { late.pop_waiting() } {
                 self.pose_gap.note(&reading);
                 return Some(Ok(reading));
             }
-            match self.recording.next()? {
-                Ok(message) => self.push(message),
-                Err(error) => return Some(Err(error.into())),
+            if self.has_ended {
+                return None;
+            }
+            match self.recording.next() {
+                Some(Ok(message)) => self.push(message),
+                Some(Err(error)) => return Some(Err(error.into())),
+                None => self.has_ended = true,
             }
         }
     }

@@ -9,6 +9,7 @@
 //! | `kinds` | file or folder -> files with their kinds, or why they cannot be read |
 //! | [`capture`] | pcap, pcapng -> readings |
 //! | [`mcap`] | recording or ROS 2 bag, in MCAP or sqlite -> readings |
+//! | `late_poses` | readings of a bag -> the same, poses before the scans that wait for them |
 //! | `unread_topics` | channels of a bag -> what is not read of them, and what helps |
 //! | `pose_gap` | readings -> how far scans are from poses |
 //! | [`ground_revolutions`] | revolutions -> the points from which a mount is estimated |
@@ -18,6 +19,7 @@ pub mod capture;
 pub mod ground_revolutions;
 mod kinds;
 pub mod kitti;
+mod late_poses;
 pub mod mcap;
 mod pose_gap;
 mod unread_topics;

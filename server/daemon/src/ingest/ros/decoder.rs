@@ -165,6 +165,11 @@ impl TopicDecoder {
         self.sensors.iter().find(|(_, index)| **index == source).map(|(topic, _)| topic.as_str())
     }
 
+    /// True if the poses of the vehicle are decoded.
+    pub fn has_poses(&self) -> bool {
+        self.pose.is_some()
+    }
+
     fn is_pose(&self, topic: &str) -> bool {
         matches!(&self.pose, Some(PoseSource::Topic(of)) if of == topic)
     }
