@@ -8,11 +8,14 @@ use clearway_mapping::event::Body;
 
 use crate::topics::available::NEAR_NS;
 
+/// Greatest time by which a scan that waits is ahead of its arrival, ns. Ours: clocks that agree differ by less.
+const SKEW_NS_MAX: i64 = 50_000_000;
 /// Longest time, of the log, for which a scan waits for a pose, ns. Ours: the motion is interpolated between two poses
 /// that are as far apart.
 const WAIT_NS: i64 = 1_000_000_000;
 
-/// Readings on their way. A pose goes before the scans that wait; everything else keeps its order and its stamps.
+/// Readings on their way. A pose goes before the scans that wait; everything else keeps its order. All readings keep
+/// their stamps and arrivals, by which steps of their clocks are found.
 #[derive(Default)]
 pub(super) struct LatePoses {
     poses: VecDeque<Reading>,
@@ -53,6 +56,11 @@ impl LatePoses {
         })
     }
 
+    /// Arrival of the first reading that waits.
+    pub(super) fn waiting_ns(&self) -> Option<i64> {
+        self.held.front().map(|reading| reading.arrival_ns)
+    }
+
     /// True while a scan may still have a pose near its stamp.
     fn waits(&self, reading: &Reading) -> bool {
         let stamp_ns = match &reading.body {
@@ -60,10 +68,11 @@ impl LatePoses {
             Body::Datagram(_) => reading.arrival_ns,
             _ => return false,
         };
-        // A scan that is farther ahead has another clock, and no pose comes.
-        let may_come =
-            |pose_ns: i64| (NEAR_NS as i64 + 1..=NEAR_NS as i64 + WAIT_NS).contains(&stamp_ns.saturating_sub(pose_ns));
+        // A scan that is farther ahead of the poses, or ahead of its own arrival, has another clock than they.
+        let ahead_ns = |of_ns: i64| stamp_ns.saturating_sub(of_ns);
+        let may_come = |pose_ns: i64| (NEAR_NS + 1..=NEAR_NS + WAIT_NS).contains(&ahead_ns(pose_ns));
         self.newest_pose_ns.is_none_or(may_come)
+            && ahead_ns(reading.arrival_ns) <= SKEW_NS_MAX
             && (0..WAIT_NS).contains(&self.newest_arrival_ns.saturating_sub(reading.arrival_ns))
     }
 }
@@ -105,7 +114,8 @@ mod tests {
         assert_eq!(order(&[(600, -100), (610, 600), (900, -400), (910, 910)]), [-100, -400, 600, 910]);
         // A pose a second.
         assert_eq!(order(&[(0, -1), (150, 150), (300, 300), (400, 400), (1000, -1000)]), [-1, 150, -1000, 300, 400]);
-        // The clock of the scans is ahead by more than a pose can be late.
+        // The clock of the scans is ahead.
+        assert_eq!(order(&[(0, -1), (100, 400), (150, -150), (200, 500)]), [-1, 400, -150, 500]);
         assert_eq!(order(&[(0, -1), (100, 1_300), (150, -150), (200, 1_400)]), [-1, 1_300, -150, 1_400]);
         // The poses have ended.
         let ended = [(0, -1), (500, 500), (1000, 1000), (1499, 1499), (1500, 1500), (2000, 2000)];

@@ -135,6 +135,11 @@ impl Source {
         &self.recording
     }
 
+    /// Arrival of the first reading that waits for a pose.
+    pub fn waiting_ns(&self) -> Option<i64> {
+        self.late_poses.waiting_ns()
+    }
+
     /// True if the readings so far came from a journal, which also contains the ends of its sources.
     pub fn is_journal(&self) -> bool {
         self.is_journal

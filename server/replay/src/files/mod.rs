@@ -125,6 +125,14 @@ impl Readings {
             }
     }
 
+    /// Arrival of the first reading that waits, ns: the newest reading, which was logged later, is due with it.
+    pub fn waiting_ns(&self) -> Option<i64> {
+        match &self.open {
+            Some(Open::Mcap(_, source)) => source.waiting_ns(),
+            _ => None,
+        }
+    }
+
     /// Format of the newest scan file; `None` before the first.
     pub fn scan_format(&self) -> Option<ScanFormat> {
         self.scan_format

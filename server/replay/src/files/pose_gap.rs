@@ -1,6 +1,6 @@
 //! How far the stamps of a drive's scans are from the stamps of its poses.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 use clearway_daemon::ingest::queue::Reading;
 use clearway_mapping::event::Body;
@@ -9,11 +9,14 @@ use crate::topics::available::NEAR_NS;
 
 /// TAI is ahead of UTC by this much from 2017 on.
 const TAI_S: f64 = 37.0;
+/// Number of poses that are kept: as in the core.
+const POSES_MAX: usize = 1024;
 
 /// The stamps of the readings so far.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PoseGap {
-    pose_ns: Option<i64>,
+    /// Stamps of the newest poses.
+    poses_ns: VecDeque<i64>,
     scans: BTreeMap<u16, ScanGap>,
 }
 
@@ -27,36 +30,41 @@ struct ScanGap {
     apart_ns: Option<i64>,
 }
 
+impl ScanGap {
+    fn note_distance(&mut self, distance_ns: u64) {
+        self.least_ns = Some(self.least_ns.map_or(distance_ns, |least_ns| least_ns.min(distance_ns)));
+    }
+}
+
 impl PoseGap {
     /// Notes the stamp of a reading. The stamp of a packet is about its arrival.
     pub(super) fn note(&mut self, reading: &Reading) {
-        let source = match &reading.body {
+        let stamp_ns = match &reading.body {
             Body::EgoPose(pose) => {
-                self.pose_ns = Some(pose.stamp_ns);
-                None
+                for scan in self.scans.values_mut() {
+                    scan.note_distance(scan.newest_ns.abs_diff(pose.stamp_ns));
+                }
+                if self.poses_ns.len() == POSES_MAX {
+                    self.poses_ns.pop_front();
+                }
+                return self.poses_ns.push_back(pose.stamp_ns);
             }
-            Body::Scan(scan) => Some(scan.stamp_ns),
-            Body::Datagram(_) => Some(reading.arrival_ns),
+            Body::Scan(scan) => scan.stamp_ns,
+            Body::Datagram(_) => reading.arrival_ns,
             _ => return,
         };
-        let pose_ns = self.pose_ns;
-        if let Some(stamp_ns) = source {
-            let scan = self.scans.entry(reading.source).or_default();
-            scan.newest_ns = stamp_ns;
-            let ahead_ns = pose_ns.map(|pose_ns| stamp_ns.saturating_sub(pose_ns));
-            scan.apart_ns = scan.apart_ns.into_iter().chain(ahead_ns).min_by_key(|ns| ns.unsigned_abs());
-        }
-        let Some(pose_ns) = pose_ns else { return };
-        for (_, scan) in self.scans.iter_mut().filter(|(of, _)| source.is_none() || **of == reading.source) {
-            let distance_ns = scan.newest_ns.abs_diff(pose_ns);
-            scan.least_ns = Some(scan.least_ns.map_or(distance_ns, |least_ns| least_ns.min(distance_ns)));
-        }
+        let scan = self.scans.entry(reading.source).or_default();
+        scan.newest_ns = stamp_ns;
+        let ahead_ns = self.poses_ns.back().map(|pose_ns| stamp_ns.saturating_sub(*pose_ns));
+        scan.apart_ns = scan.apart_ns.into_iter().chain(ahead_ns).min_by_key(|ns| ns.unsigned_abs());
+        let nearest_ns = self.poses_ns.iter().map(|pose_ns| stamp_ns.abs_diff(*pose_ns)).min();
+        nearest_ns.into_iter().for_each(|distance_ns| scan.note_distance(distance_ns));
     }
 
     /// A line for people for each source without a scan near a pose; `name` names the source.
     pub(super) fn notes(&self, name: impl Fn(u16) -> String) -> Vec<String> {
         let far = self.scans.iter().filter_map(|(source, scan)| {
-            scan.least_ns.filter(|least_ns| *least_ns > NEAR_NS)?;
+            scan.least_ns.filter(|least_ns| *least_ns > NEAR_NS as u64)?;
             let ahead_s = scan.apart_ns? as f64 * 1e-9;
             let way = if ahead_s > 0.0 { "ahead of" } else { "behind" };
             let hint = match ahead_s.abs() {

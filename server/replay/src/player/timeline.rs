@@ -42,7 +42,8 @@ pub struct Timeline {
 pub struct TimedReading {
     /// Index of the vehicle.
     pub vehicle: usize,
-    /// Recorded time: the reading's arrival, without a step of the clock that is a fault.
+    /// Recorded time: the reading's arrival, or that of the scan that waits for this pose; without a step of the clock
+    /// that is a fault.
     pub at_ns: i64,
     /// The reading that arrives at this time.
     pub reading: Reading,
@@ -190,7 +191,11 @@ impl Merged {
                 *next = readings.next().transpose()?;
             }
         }
-        let times = self.tracks.iter().enumerate().filter_map(|(i, (_, next))| Some((next.as_ref()?.arrival_ns, i)));
+        let due_ns = |(readings, next): &(Readings, Option<Reading>)| {
+            let arrival_ns = next.as_ref()?.arrival_ns;
+            Some(readings.waiting_ns().map_or(arrival_ns, |waiting_ns| arrival_ns.min(waiting_ns)))
+        };
+        let times = self.tracks.iter().enumerate().filter_map(|(i, track)| Some((due_ns(track)?, i)));
         let Some((at_ns, vehicle)) = times.min() else { return Ok(None) };
         let (readings, next) = &mut self.tracks[vehicle];
         let refused = readings.drain_refused();

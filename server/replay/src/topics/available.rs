@@ -16,7 +16,7 @@ use nalgebra::Isometry3;
 pub(super) const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
 
 /// Greatest distance of a scan from a pose that gives the scan a pose, in ns; as the core extrapolates.
-pub const NEAR_NS: u64 = 200_000_000;
+pub const NEAR_NS: i64 = 200_000_000;
 
 /// Greatest difference of two static transforms that state one mount, in metres and radians. Ours: they are written
 /// with that many digits.
@@ -230,7 +230,7 @@ impl Stamps {
     pub fn ahead_ns(&self, of: &Self) -> Option<i64> {
         let ((least_ns, greatest_ns), (of_least_ns, of_greatest_ns)) = self.range_ns.zip(of.range_ns)?;
         let gap_ns = least_ns.saturating_sub(of_greatest_ns).max(of_least_ns.saturating_sub(greatest_ns));
-        Some(if gap_ns > NEAR_NS as i64 { least_ns.saturating_sub(of_least_ns) } else { 0 })
+        Some(if gap_ns > NEAR_NS { least_ns.saturating_sub(of_least_ns) } else { 0 })
     }
 }
 
