@@ -205,20 +205,23 @@ async fn the_queue_of_a_recorder_costs_no_map_its_pose() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn poses_that_are_logged_late_or_seldom_are_of_the_maps_of_their_time() {
-    // Time from one pose to the next, and from its stamp to its log time, ms.
-    for (period_ms, late_ms) in [(20, 300), (20, 900), (500, 0), (500, 300), (1000, 0)] {
+async fn poses_and_scans_that_are_logged_late_or_seldom_find_each_other() {
+    // Time from one pose to the next, from its stamp to its log time, and by which a cloud is logged later, ms.
+    for (period_ms, late_ms, cloud_late_ms) in
+        [(20, 300, 0), (20, 900, 0), (500, 0, 0), (500, 300, 0), (1000, 0, 0), (20, 0, 500)]
+    {
         let mut messages = drive_of(24, |ns| velodyne("velodyne", ns));
         messages.retain_mut(|(topic, _, log_ns, _)| {
             let after_ns = *log_ns - START_NS;
-            *log_ns += if *topic == "/tf" { late_ms * 1_000_000 } else { 0 };
+            *log_ns += if *topic == "/tf" { late_ms } else { cloud_late_ms } * 1_000_000;
             *topic != "/tf" || after_ns % (period_ms * 1_000_000) == 0
         });
         let (summary, headers) = replayed_bag(messages, &[]).await;
-        let what = format!("each {period_ms} ms, {late_ms} ms late: {:?}", xs(&headers));
+        let what = format!("each {period_ms} ms, {late_ms} and {cloud_late_ms} ms late: {:?}", xs(&headers));
         // tf has no speed, and the first pose none before it.
         let least = (24 - period_ms / 100 - 4) as u64;
         assert!(headers.len() == 24 && summary.snapshot.maps_with_pose >= least, "{what}");
+        assert!(!summary.to_text().contains("no scan of"), "{what}: {}", summary.to_text());
         for header in headers {
             let Some(pose) = &header.map_from_ego else { continue };
             let driven_m = position_m(header.capture_end_ns - START_NS);

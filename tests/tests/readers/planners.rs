@@ -44,6 +44,12 @@ fn of_cpp(program: &str) -> PathBuf {
     let built = BUILT.get_or_init(|| {
         let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("cpp-client");
         let [prefix, project, build] = ["prefix", "project", "build"].map(|name| folder.join(name));
+        let client = workspace().join("client/cpp");
+        // CMake refuses what another clone with the same target folder has built.
+        let cache = fs::read_to_string(folder.join("client/CMakeCache.txt")).unwrap_or_default();
+        if !cache.contains(&format!("={}\n", client.display())) {
+            let _ = fs::remove_dir_all(&folder);
+        }
         fs::create_dir_all(&project).expect("a folder of ours");
         fs::write(project.join("CMakeLists.txt"), PROJECT).expect("a file of ours");
         for source in ["examples/follow.cpp", "tests/answers.cpp"] {
@@ -52,7 +58,6 @@ fn of_cpp(program: &str) -> PathBuf {
         }
         let cmake = || Command::new("cmake");
         let option = |name: &str, path: &Path| format!("-D{name}={}", path.display());
-        let client = workspace().join("client/cpp");
         run(cmake().arg("-S").arg(client).arg("-B").arg(folder.join("client")), "CMake says why");
         run(cmake().arg("--install").arg(folder.join("client")).arg("--prefix").arg(&prefix), "CMake says why");
         let prefix = option("CMAKE_PREFIX_PATH", &prefix);
