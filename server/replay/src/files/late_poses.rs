@@ -84,25 +84,25 @@ mod tests {
 
     use super::*;
 
-    /// The stamps, in ms, of the readings of a log in the order in which they are given: scans, and poses as negative
-    /// numbers. A reading of the log is its arrival and its number, in ms.
+    /// The readings of a log in the order in which they are given. A scan is its stamp in ms, a pose its negative stamp;
+    /// the log has the arrival of each before it, ms.
     fn order(log_ms: &[(i64, i64)]) -> Vec<i64> {
         let (mut late, mut given) = (LatePoses::default(), Vec::new());
-        let number_ms = |reading: &Reading| match &reading.body {
+        let number = |reading: &Reading| match &reading.body {
             Body::EgoPose(pose) => -pose.stamp_ns / 1_000_000,
             Body::Scan(scan) => scan.stamp_ns / 1_000_000,
             _ => 0,
         };
-        for &(arrival_ms, number_ms_of) in log_ms {
-            let stamp_ns = number_ms_of.abs() * 1_000_000;
-            let body = match number_ms_of {
+        for &(arrival_ms, signed_ms) in log_ms {
+            let stamp_ns = signed_ms.abs() * 1_000_000;
+            let body = match signed_ms {
                 ..0 => Body::EgoPose(EgoPose { stamp_ns, map_from_ego: Isometry3::identity(), speed_mps: 0.0 }),
                 0.. => Body::Scan(Scan { stamp_ns, ..Scan::default() }),
             };
             late.push(Reading { arrival_ns: arrival_ms * 1_000_000, source: 0, body });
-            given.extend(std::iter::from_fn(|| late.pop()).map(|reading| number_ms(&reading)));
+            given.extend(std::iter::from_fn(|| late.pop()).map(|reading| number(&reading)));
         }
-        given.extend(std::iter::from_fn(|| late.pop_waiting()).map(|reading| number_ms(&reading)));
+        given.extend(std::iter::from_fn(|| late.pop_waiting()).map(|reading| number(&reading)));
         given
     }
 

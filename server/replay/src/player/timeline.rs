@@ -42,8 +42,8 @@ pub struct Timeline {
 pub struct TimedReading {
     /// Index of the vehicle.
     pub vehicle: usize,
-    /// Recorded time: the reading's arrival, or that of the scan that waits for this pose; without a step of the clock
-    /// that is a fault.
+    /// Recorded time: the reading's arrival, or for a pose that a scan waits for, the scan's arrival; without a step of
+    /// the clock that is a fault.
     pub at_ns: i64,
     /// The reading that arrives at this time.
     pub reading: Reading,
