@@ -84,8 +84,8 @@ mod tests {
 
     use super::*;
 
-    /// The readings of a log in the order in which they are given. A scan is its stamp in ms, a pose its negative stamp;
-    /// the log has the arrival of each before it, ms.
+    /// The readings of a log in the order in which they are given. A scan is its stamp in ms, a pose its negative
+    /// stamp; the log has the arrival of each before it, ms.
     fn order(log_ms: &[(i64, i64)]) -> Vec<i64> {
         let (mut late, mut given) = (LatePoses::default(), Vec::new());
         let number = |reading: &Reading| match &reading.body {

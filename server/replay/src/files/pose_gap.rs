@@ -81,3 +81,27 @@ impl PoseGap {
         far.collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use clearway_mapping::event::{EgoPose, Scan};
+    use nalgebra::Isometry3;
+
+    use super::*;
+
+    #[test]
+    fn a_scan_that_is_logged_late_is_near_the_pose_of_its_time_and_one_of_another_clock_is_not() {
+        let reading = |body| Reading { arrival_ns: 0, source: 0, body };
+        for (stamp_ms, notes) in [(1_500, 0), (39_000, 1)] {
+            let mut gap = PoseGap::default();
+            for stamp_ns in (0..=100).map(|pose| pose * 20_000_000) {
+                let pose = EgoPose { stamp_ns, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };
+                gap.note(&reading(Body::EgoPose(pose)));
+            }
+            gap.note(&reading(Body::Scan(Scan { stamp_ns: stamp_ms * 1_000_000, ..Scan::default() })));
+            let said = gap.notes(|_| "/points".to_owned());
+            assert_eq!(said.len(), notes, "{said:?}");
+            assert!(said.iter().all(|line| line.contains("37.0 s ahead of")), "{said:?}");
+        }
+    }
+}
